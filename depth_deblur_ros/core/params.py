@@ -55,9 +55,11 @@ def _checked(knob: Field[Any], value: Any) -> Any:
             raise InputError(f'{knob.name} must be one of {knob.metadata["choices"]}, got {value!r}')
         return value
     kind = type(knob.default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or kind(value) != value:
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f'{knob.name} must be of type {kind.__name__}, got {value!r}')
     low, high = knob.metadata['low'], knob.metadata['high']
     if not math.isfinite(value) or not low <= value <= high:
         raise InputError(f'{knob.name} must lie in [{low}, {high}], got {value}')
+    if kind(value) != value:
+        raise InputError(f'{knob.name} must be of type {kind.__name__}, got {value!r}')
     return kind(value)
