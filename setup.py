@@ -1,0 +1,65 @@
+"""How colcon and pip install the package."""
+
+from setuptools import find_packages, setup
+
+NAME = 'depth_deblur_ros'
+# ROS from wheels exists for x86_64 alone; elsewhere, and on robots, rclpy comes with ROS itself.
+ON_X86_LINUX = "; sys_platform == 'linux' and platform_machine == 'x86_64'"
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Deblurs RGB-D images and tells the camera motion during the exposure',
+    license='Apache-2.0',
+    maintainer='depth_deblur_ros maintainers',
+    maintainer_email='maintainers@example.org',
+    python_requires='>=3.11',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', ['config/deblur.yaml']),
+    ],
+    zip_safe=False,
+    install_requires=[  # the lowest versions are those of Ubuntu 24.04
+        'setuptools',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'opencv-python-headless>=4.6',
+        'numba>=0.58',
+        'PyYAML>=6.0',
+        'tqdm>=4.66',
+        'rosbags>=0.11',
+        'mcap>=1.2',
+    ],
+    extras_require={
+        'ros': [
+            f'ros-jazzy-rclpy[fastrtps]==7.1.6{ON_X86_LINUX}',
+            f'ros-jazzy-common-interfaces==5.3.6{ON_X86_LINUX}',
+        ],
+        'bench': ['scikit-image>=0.22'],
+        'test': [
+            'pytest>=8',
+            'pytest-timeout>=2.2',
+            'hypothesis>=6.98',
+            'mcap-ros2-support>=0.5',
+            'scikit-image>=0.22',
+            'colcon-common-extensions>=0.3',
+            'colcon-ros>=0.5',
+        ],
+        'lint': [
+            'ruff>=0.17,<0.18',
+            'mypy>=2.4,<2.5',
+            'types-PyYAML',
+            'types-tqdm',
+            'scipy-stubs',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            f'depth-deblur = {NAME}.cli:main',
+            f'replay = {NAME}.cli:replay_main',
+        ],
+    },
+)
