@@ -1,0 +1,111 @@
+"""
+Colour with depth by time stamp: one rule for the live topics and for a bag.
+
+Each colour frame takes its nearest depth within the slop; a depth may serve several. As long as the
+stamps of each stream rise, the pairs do not depend on how the two streams interleave.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Generic, TypeVar
+
+A = TypeVar('A')
+B = TypeVar('B')
+
+NO_DEPTH = 'no depth within the slop'
+DUPLICATE = 'colour stamp seen before'
+LATE = 'colour stamp older than that of a frame already paired'
+
+_NEVER = -(2**63)
+_JUMP_NS = 1_000_000_000  # older than its stream by more than this: time was set back, a bag loops
+
+
+class StampPairer(Generic[A, B]):
+    """
+    Give each colour item its nearest depth item within slop_ns, in the order of the colour stamps.
+
+    A colour frame waits until a depth stamp has come that is not older: from then on no nearer one
+    can come. At most `keep` items of each kind are held. `dropped` counts the colour frames without
+    a pair, by reason; `nearest_miss_ns` is the smallest gap that was too wide.
+    """
+
+    def __init__(self, slop_ns: int, keep: int = 64) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.nearest_miss_ns: int | None = None
+        self._slop_ns = slop_ns
+        self._keep = keep
+        self._clear()
+
+    def push_colour(self, stamp_ns: int, item: A) -> list[tuple[A, B]]:
+        """Take a colour item; give the pairs that can be told now."""
+        pairs = self._restart(stamp_ns, self._newest_colour)
+        if stamp_ns in self._colour or stamp_ns == self._decided:
+            self.dropped[DUPLICATE] += 1
+        elif stamp_ns < self._decided:
+            self.dropped[LATE] += 1
+        else:
+            self._colour[stamp_ns] = item
+            self._newest_colour = max(self._newest_colour, stamp_ns)
+        return pairs + self._decide()
+
+    def push_depth(self, stamp_ns: int, item: B) -> list[tuple[A, B]]:
+        """Take a depth item; give the pairs that can be told now."""
+        pairs = self._restart(stamp_ns, self._newest_depth)
+        self._depth.setdefault(stamp_ns, item)
+        self._newest_depth = max(self._newest_depth, stamp_ns)
+        return pairs + self._decide()
+
+    def flush(self) -> list[tuple[A, B]]:
+        """Give the remaining pairs: nothing more will come."""
+        return self._decide(waiting=False)
+
+    def _clear(self) -> None:
+        self._colour: dict[int, A] = {}
+        self._depth: dict[int, B] = {}
+        self._newest_colour = _NEVER
+        self._newest_depth = _NEVER
+        self._decided = _NEVER
+
+    def _restart(self, stamp_ns: int, newest: int) -> list[tuple[A, B]]:
+        """Finish and forget what was before, where time has jumped back."""
+        if stamp_ns >= newest - _JUMP_NS:
+            return []
+        pairs = self.flush()
+        self._clear()
+        return pairs
+
+    def _decide(self, waiting: bool = True) -> list[tuple[A, B]]:
+        pairs = []
+        while self._colour:
+            stamp = min(self._colour)
+            known = self._newest_depth >= stamp
+            if waiting and not known and len(self._colour) <= self._keep:
+                break
+            colour, depth = self._colour.pop(stamp), self._nearest(stamp)
+            self._decided = stamp
+            if depth is None:
+                self.dropped[NO_DEPTH] += 1
+            else:
+                pairs.append((colour, self._depth[depth]))
+        self._forget()
+        return pairs
+
+    def _nearest(self, stamp_ns: int) -> int | None:
+        """Give the stamp of the nearest depth within the slop, the older one of two as near."""
+        if not self._depth:
+            return None
+        nearest = min(self._depth, key=lambda stamp: (abs(stamp - stamp_ns), stamp))
+        gap = abs(nearest - stamp_ns)
+        if gap <= self._slop_ns:
+            return nearest
+        self.nearest_miss_ns = min(gap, self.nearest_miss_ns or gap)
+        return None
+
+    def _forget(self) -> None:
+        """Drop depths that no colour frame to come can want, and the oldest of too many."""
+        passed = sorted(stamp for stamp in self._depth if stamp <= self._decided)
+        for stamp in passed[:-1]:
+            del self._depth[stamp]
+        while len(self._depth) > self._keep:
+            del self._depth[min(self._depth)]
