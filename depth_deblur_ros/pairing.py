@@ -1,8 +1,8 @@
 """
 Colour with depth by time stamp: one rule for the live topics and for a bag.
 
-Each colour frame takes its nearest depth within the slop; a depth may serve several. As long as the
-stamps of each stream rise, the pairs do not depend on how the two streams interleave.
+Each colour frame takes its nearest depth within the slop; a depth may serve several. As long as
+the stamps of each stream rise, the pairs do not depend on how the two streams interleave.
 """
 
 from __future__ import annotations
@@ -26,9 +26,13 @@ class StampPairer(Generic[A, B]):
     Give each colour item its nearest depth item within slop_ns, in the order of the colour stamps.
 
     A colour frame waits until a depth stamp has come that is not older: from then on no nearer one
-    can come. At most `keep` items of each kind are held. `dropped` counts the colour frames without
-    a pair, by reason; `nearest_miss_ns` is the smallest gap that was too wide.
+    can come. At most `keep` items of each kind are held. `dropped` counts the colour frames
+    without a pair, by reason; `nearest_miss_ns` is the smallest gap that was too wide.
     """
+
+    _newest_colour: int
+    _newest_depth: int
+    _decided: int
 
     def __init__(self, slop_ns: int, keep: int = 64) -> None:
         self.dropped: Counter[str] = Counter()
