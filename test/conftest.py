@@ -1,0 +1,26 @@
+"""Settings that every test shares."""
+
+import os
+from pathlib import Path
+
+from hypothesis import settings
+import pytest
+
+settings.register_profile('ci', derandomize=True, deadline=None)
+settings.register_profile('here', deadline=None)  # the first call compiles
+settings.load_profile('ci' if os.environ.get('CI') else 'here')
+
+
+@pytest.fixture(autouse=True, scope='session')
+def ros_logs_stay_here(tmp_path_factory):
+    """ROS piles up logs in the home directory, and needs one, unless told otherwise."""
+    os.environ['ROS_LOG_DIR'] = str(tmp_path_factory.mktemp('ros_log'))
+
+
+@pytest.fixture(scope='session')
+def data():
+    """Give the folder of evaluation data."""
+    folder = os.environ.get('DEPTH_DEBLUR_DATA')
+    if not folder:
+        pytest.skip('DEPTH_DEBLUR_DATA is not set')
+    return Path(folder)
