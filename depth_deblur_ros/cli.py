@@ -1,0 +1,253 @@
+"""
+Command line: images, folders of cases and bags in; sharp images, the motion and pictures out.
+
+The only file that prints, and the only one that turns an InputError into an exit code: 0 done,
+1 some frames failed, 2 bad input with one line on the error output, 130 interrupted.
+What is slow to load is imported by the command that needs it, so that --help is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+import itertools
+from pathlib import Path
+import re
+import sys
+from typing import Any, NoReturn
+
+from depth_deblur_ros.core.data import DeblurResult, InputError, Outcome, RgbdFrame
+from depth_deblur_ros.core.params import knobs, params_from_mapping, SolverParams
+from tqdm import tqdm
+import yaml
+
+DONE, SOME_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+PRESETS = ('tum_fr1', 'tum_fr2', 'tum_fr3')
+
+
+class _Parser(argparse.ArgumentParser):
+    """Say what is wrong in one line, as for every other bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f'{message} (see {self.prog} --help)')
+
+
+class _RosYaml(yaml.SafeLoader):
+    """Read 1e-05 as a number, as ROS does; YAML 1.1 takes it for text."""
+
+
+_RosYaml.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+$'), list('-+0123456789')
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and give its exit code."""
+    try:
+        args = _parser().parse_args(argv)
+        code: int = args.run(args)
+        return code
+    except (InputError, OSError) as error:
+        print(f'depth-deblur: {error}', file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print('depth-deblur: interrupted', file=sys.stderr)
+        return INTERRUPTED
+
+
+def replay_main() -> int:
+    """Run `depth-deblur replay`, the executable that `ros2 run depth_deblur_ros replay` starts."""
+    return main(['replay', *sys.argv[1:]])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog='depth-deblur', description='Deblur RGB-D images and tell the motion.')
+    commands = parser.add_subparsers(metavar='COMMAND', required=True)
+
+    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> _Parser:
+        added = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        added.set_defaults(run=run)
+        return added
+
+    _image_flags(command('image', _image, 'one blurred image and its depth: sharp image, motion'))
+    _bench_flags(command('bench', _bench, 'folders of images, scored where the truth is known'))
+    _import_flags(
+        command('import-tum', _import_tum, 'a TUM-format folder into a rosbag2 mcap bag')
+    )
+    _replay_flags(command('replay', _replay, 'a bag: every pair solved, results in another bag'))
+    return parser
+
+
+def _image_flags(parser: _Parser) -> None:
+    parser.add_argument('rgb', type=Path, help='colour image, 8 bit')
+    parser.add_argument('depth', type=Path, help='depth image, 16 bit, registered to the colour')
+    parser.add_argument('--camera', type=Path, required=True, help='camera.json')
+    parser.add_argument('-o', '--out', type=Path, required=True, metavar='DIR', help='results')
+    _solver_flags(parser)
+
+
+def _image(args: argparse.Namespace) -> int:
+    from depth_deblur_ros.core.solver import deblur
+    from depth_deblur_ros.folders import read_frame, write_image, write_json
+    from depth_deblur_ros.replay import motion_record
+
+    params = _solver_params(args)
+    frame = read_frame(args.rgb, args.depth, args.camera)
+    result = deblur(frame, params)
+    write_image(args.out / 'deblurred.png', result.image)
+    write_json(args.out / 'motion.json', motion_record(result, frame.stamp_ns, frame.exposure))
+    print(
+        f'{result.outcome.value}: blur {result.blur_px:.1f} px, quality {result.quality:.2f}, '
+        f'{result.seconds:.1f} s; {args.out}/deblurred.png, {args.out}/motion.json'
+    )
+    return SOME_FAILED if result.outcome is Outcome.FAILED else DONE
+
+
+def _bench_flags(parser: _Parser) -> None:
+    parser.add_argument('cases', type=Path, help='folder of case folders')
+    parser.add_argument('-o', '--out', type=Path, required=True, metavar='RESULTS')
+    parser.add_argument(
+        '--oracle', action='store_true', help='take the motion from truth/motion.json as known'
+    )
+    _solver_flags(parser)
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from depth_deblur_ros import bench
+
+    params = _solver_params(args)
+    cases = bench.find_cases(args.cases)
+    solving = bench.solve_cases(cases, args.out, params, oracle=args.oracle)
+    rows = list(_bar(solving, len(cases), 'case'))
+    bench.write_tables(rows, args.out)
+    print('\n'.join([bench.table_head(), *map(bench.table_line, bench.with_means(rows))]))
+    failed = any(row.outcome in ('failed', 'error') for row in rows)
+    return SOME_FAILED if failed else DONE
+
+
+def _import_flags(parser: _Parser) -> None:
+    parser.add_argument('folder', type=Path, help='rgb/, depth/ and their lists')
+    parser.add_argument('bag', type=Path, help='bag to write')
+    camera = parser.add_mutually_exclusive_group()
+    camera.add_argument('--camera', type=Path, help='camera.json (default: FOLDER/camera.json)')
+    camera.add_argument('--preset', choices=PRESETS, help='the published calibration of a camera')
+    parser.add_argument('--overwrite', action='store_true', help='replace BAG if it is there')
+
+
+def _import_tum(args: argparse.Namespace) -> int:
+    from depth_deblur_ros.folders import import_tum
+
+    summary = import_tum(
+        args.folder, args.bag, camera=args.camera, preset=args.preset, overwrite=args.overwrite
+    )
+    print(f'{args.bag}: {summary}')
+    return DONE
+
+
+def _replay_flags(parser: _Parser) -> None:
+    parser.add_argument('bag', type=Path, help='rosbag2 folder or .mcap file to read')
+    parser.add_argument('out', type=Path, help='bag to write')
+    parser.add_argument('--estimates', type=Path, metavar='FILE', help='one line of JSON per pair')
+    parser.add_argument('--pictures', type=Path, metavar='DIR', help='one picture per frame')
+    parser.add_argument('--camera', type=Path, help='camera.json instead of the camera_info topic')
+    parser.add_argument('--exposure-s', type=float, metavar='S', help='exposure of every frame')
+    parser.add_argument(
+        '--topics',
+        nargs='+',
+        type=_topic,
+        metavar='NAME=TOPIC',
+        help='where to find colour, depth, info (default: the usual names, else the only fit)',
+    )
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='skip S seconds')
+    parser.add_argument('--duration', type=float, metavar='S', help='stop after S seconds')
+    parser.add_argument('--all-topics', action='store_true', help='copy the other topics too')
+    parser.add_argument('--overwrite', action='store_true', help='replace OUT if it is there')
+    _solver_flags(parser)
+
+
+def _topic(text: str) -> tuple[str, str]:
+    name, equals, topic = text.partition('=')
+    if not (name and equals and topic):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form NAME=TOPIC')
+    return name, topic
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from depth_deblur_ros.replay import replay
+
+    params = _solver_params(args)
+    with _bar('frame') as bar:
+        summary = replay(
+            args.bag,
+            args.out,
+            params=params,
+            camera=args.camera,
+            exposure_s=args.exposure_s,
+            topics=dict(args.topics or ()),
+            start=args.start,
+            duration=args.duration,
+            all_topics=args.all_topics,
+            estimates=args.estimates,
+            progress=bar.progress,
+            on_frame=_painter(args.pictures) if args.pictures else None,
+            overwrite=args.overwrite,
+        )
+    print(f'{args.out}: {summary}')
+    return SOME_FAILED if summary.failed else DONE
+
+
+def _painter(folder: Path) -> Callable[[RgbdFrame, DeblurResult], None]:
+    """Give what writes one picture per frame, numbered in the order of the frames."""
+    from depth_deblur_ros.folders import write_image
+    from depth_deblur_ros.report import draw_frame
+
+    numbers = itertools.count()
+
+    def paint(frame: RgbdFrame, result: DeblurResult) -> None:
+        write_image(folder / f'{next(numbers):05d}.png', draw_frame(frame, result))
+
+    return paint
+
+
+def _bar(unit: str, total: int | None = None) -> tqdm[NoReturn]:
+    """Give a progress bar on a terminal, with frames per second and the remaining time."""
+    return tqdm(total=total, unit=unit, disable=not sys.stderr.isatty())
+
+
+def _solver_flags(parser: _Parser) -> None:
+    """Add --params and one flag for each solver parameter; a flag counts more than the file."""
+    group = parser.add_argument_group('solver parameters')
+    group.add_argument('--params', type=Path, metavar='FILE', help='YAML, as ROS takes it')
+    for knob in knobs():
+        meta = knob.metadata
+        limits = (
+            '|'.join(meta['choices']) if 'choices' in meta else f'{meta["low"]}..{meta["high"]}'
+        )
+        group.add_argument(
+            '--' + knob.name.replace('_', '-'),
+            type=type(knob.default),
+            default=argparse.SUPPRESS,
+            metavar=limits,
+            help=f'{meta["help"]} (default: {knob.default})'.replace('%', '%%'),
+        )
+
+
+def _solver_params(args: argparse.Namespace) -> SolverParams:
+    base = params_from_mapping(_read_params(args.params) if args.params else {})
+    given = {knob.name: getattr(args, knob.name) for knob in knobs() if hasattr(args, knob.name)}
+    return params_from_mapping(given, base)
+
+
+def _read_params(path: Path) -> dict[str, Any]:
+    """Read what stands under /**: ros__parameters: of a ROS parameter file."""
+    try:
+        content = yaml.load(path.read_text(), _RosYaml)
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror}') from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        line = ' '.join(str(error).split())
+        raise InputError(f'{path} is not YAML: {line}') from error
+    try:
+        return dict(content['/**']['ros__parameters'])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f'{path} must hold /**: ros__parameters: NAME: VALUE') from None
