@@ -40,6 +40,7 @@ setup(
         ],
         'bench': ['scikit-image>=0.22'],
         'test': [
+            'setuptools>=71',
             'pytest>=8',
             'pytest-timeout>=2.2',
             'hypothesis>=6.98',
