@@ -48,7 +48,6 @@ def test_colcon_takes_it_for_an_ament_python_package(clone, colcon):
     ]
 
 
-@pytest.mark.slow
 def test_colcon_puts_replay_where_ros_looks_for_it(clone, colcon):
     workspace = clone.parents[1]
     run(colcon, 'build', '--packages-select', NAME, cwd=workspace)
@@ -63,7 +62,6 @@ def test_colcon_puts_replay_where_ros_looks_for_it(clone, colcon):
     assert 'usage: depth-deblur replay' in run('bash', '-c', started, cwd=workspace)
 
 
-@pytest.mark.slow
 def test_a_wheel_puts_depth_deblur_on_the_path(clone, tmp_path):
     pip = [sys.executable, '-m', 'pip', '--disable-pip-version-check']
     run(*pip, 'wheel', '--no-deps', '--no-build-isolation', '-w', tmp_path, clone)
