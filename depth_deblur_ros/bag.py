@@ -1,25 +1,125 @@
 """
-Messages out of mcap bags, results into one; the only file that imports rosbags and mcap.
+Messages out of mcap bags, results into one.
 
-A bag is written whole or not at all: into a hidden folder beside its target, renamed at the end.
+A bag is written into a hidden folder beside its target, which takes its name when it is whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+import heapq
+import itertools
 from pathlib import Path
 import shutil
 import tempfile
 from typing import Any
 
 from depth_deblur_ros.core.data import InputError
+from depth_deblur_ros.mcap_file import BagMessage, Block, McapFile, Topic
 import numpy as np
 from rosbags.interfaces import Connection, Nodetype
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, ReaderError, StoragePlugin, Writer
+from rosbags.rosbag2.metadata import parse_qos
+from rosbags.serde import SerdeError
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores, TypesysError
+import yaml
 
 _TYPES = get_typestore(Stores.ROS2_JAZZY)
+
+
+class BagReader:
+    """Read a rosbag2 bag, folder or file, in the order of the log times."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self._missing: list[str] = []
+        self._files: list[McapFile] = []
+        try:
+            for file in self._paths():
+                self._files.append(McapFile(file))
+            blocks = [(block, file) for file in self._files for block in file.blocks]
+            self._blocks = sorted(blocks, key=lambda entry: (entry[0][:3], entry[1].name))
+            filled = [block for block, _ in self._blocks if block.end_ns or block.counts]
+            if not filled:
+                raise InputError(f'{path} holds no messages; {"; ".join(self.damage) or "empty"}')
+        except InputError:
+            self.close()
+            raise
+        self.start_ns = filled[0].start_ns
+        self.end_ns = max(block.end_ns for block in filled)
+        self.topics = {t.name: t for file in self._files for t in file.topics.values()}
+
+    def __enter__(self) -> BagReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files:
+            file.close()
+
+    @property
+    def damage(self) -> list[str]:
+        """What could not be read so far, and where."""
+        return [*self._missing, *(note for file in self._files for note in file.damage)]
+
+    def messages(
+        self, topics: Collection[str], start_ns: int = 0, end_ns: int | None = None
+    ) -> Iterator[BagMessage]:
+        """Give the messages of the topics with start <= log time < end."""
+        heap: list[tuple[int, int, BagMessage]] = []
+        number = itertools.count()  # keeps the file's order where log times are equal
+        for block, file in self._between(start_ns, end_ns):
+            while heap and heap[0][0] < block.start_ns:
+                yield heapq.heappop(heap)[2]
+            for message in file.read(block):
+                late = end_ns is not None and message.log_ns >= end_ns
+                if message.topic.name in topics and message.log_ns >= start_ns and not late:
+                    heapq.heappush(heap, (message.log_ns, next(number), message))
+        while heap:
+            yield heapq.heappop(heap)[2]
+
+    def count(self, topic: str, start_ns: int = 0, end_ns: int | None = None) -> int:
+        """Count the messages of a topic by the index, to a chunk; 0 where there is no index."""
+        return sum(file.count(block, topic) for block, file in self._between(start_ns, end_ns))
+
+    def _between(self, start_ns: int, end_ns: int | None) -> Iterator[tuple[Block, McapFile]]:
+        for block, file in self._blocks:
+            if block.end_ns >= start_ns and (end_ns is None or block.start_ns < end_ns):
+                yield block, file
+
+    def _paths(self) -> list[Path]:
+        if not self.path.exists():
+            raise InputError(f'{self.path} does not exist')
+        if self.path.is_file():
+            return [self.path]
+        found = {p for p in self.path.iterdir() if p.name.endswith(('.mcap', '.mcap.zstd'))}
+        if not found:
+            raise InputError(f'{self.path} holds no .mcap file: not an mcap bag')
+        listed = set(_listed_files(self.path))
+        self._missing += [f'{p.name} is missing from the bag' for p in sorted(listed - found)]
+        return sorted(found & listed or found)
+
+
+def decoded(message: BagMessage) -> Any:
+    """Make the object of a message's standard ROS type."""
+    try:
+        return _TYPES.deserialize_cdr(message.data, message.topic.type)
+    except (SerdeError, KeyError, AssertionError, IndexError) as error:
+        raise InputError(f'a message on {message.topic.name} cannot be read: {error}') from error
+
+
+def _listed_files(folder: Path) -> list[Path]:
+    """Give the files that metadata.yaml names; none where it is missing or damaged."""
+    try:
+        content = yaml.safe_load((folder / 'metadata.yaml').read_text())
+        names = content['rosbag2_bagfile_information']['relative_file_paths']
+        return [folder / Path(name).name for name in names]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        return []
 
 
 class BagWriter:
@@ -57,11 +157,27 @@ class BagWriter:
 
     def write(self, topic: str, type_name: str, fields: Mapping[str, Any], log_ns: int) -> None:
         """Append one message, given by its fields; those not named are zero."""
-        data = _TYPES.serialize_cdr(_message(type_name, fields), type_name)
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, type_name, typestore=_TYPES
             )
+        self._append(topic, log_ns, _TYPES.serialize_cdr(_message(type_name, fields), type_name))
+
+    def copy(self, message: BagMessage) -> None:
+        """Append a message of another bag as it is."""
+        topic = message.topic
+        if topic.name not in self._connections:
+            self._connections[topic.name] = self._writer.add_connection(
+                topic.name,
+                topic.type,
+                msgdef=topic.definition,
+                rihs01=topic.metadata.get('topic_type_hash') or _type_hash(topic),
+                serialization_format=topic.encoding,
+                offered_qos_profiles=_qos(topic),
+            )
+        self._append(topic.name, message.log_ns, message.data)
+
+    def _append(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         with _writing(self._path):
             self._writer.write(self._connections[topic], log_ns, data)
 
@@ -78,6 +194,22 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+
+
+def _type_hash(topic: Topic) -> str:
+    types = get_typestore(Stores.EMPTY)
+    try:
+        types.register(get_types_from_msg(topic.definition, topic.type))
+        return types.hash_rihs01(topic.type)
+    except (TypesysError, KeyError):
+        return f'RIHS01_{0:064x}'
+
+
+def _qos(topic: Topic) -> list[Any]:
+    try:
+        return parse_qos(topic.metadata.get('offered_qos_profiles', ''))
+    except (ReaderError, KeyError, TypeError):
+        return []
 
 
 def _message(type_name: str, fields: Mapping[str, Any]) -> Any:
