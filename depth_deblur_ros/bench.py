@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 import json
+import math
 from pathlib import Path
 
 from depth_deblur_ros.core.data import DeblurResult, FloatImage, InputError, Motion, RgbdFrame
@@ -172,8 +173,8 @@ def write_tables(rows: Sequence[Row], results: Path) -> None:
 
 def psnr(a: Image8, b: Image8) -> float:
     """Give the peak signal-to-noise ratio [dB] of two 8-bit images."""
-    error = np.mean((a / 255.0 - b / 255.0) ** 2)
-    return float(min(-10 * np.log10(max(error, 1e-10)), PSNR_LIMIT))
+    error = float(np.mean((a / 255.0 - b / 255.0) ** 2))
+    return min(-10 * math.log10(max(error, 1e-10)), PSNR_LIMIT)
 
 
 def ssim(a: Image8, b: Image8) -> float:

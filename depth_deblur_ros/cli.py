@@ -118,7 +118,7 @@ def _bench(args: argparse.Namespace) -> int:
     params = _solver_params(args)
     cases = bench.find_cases(args.cases)
     solving = bench.solve_cases(cases, args.out, params, oracle=args.oracle)
-    rows = list(_bar(solving, len(cases), 'case'))
+    rows = list(tqdm(solving, total=len(cases), unit='case', disable=None))
     bench.write_tables(rows, args.out)
     print('\n'.join([bench.table_head(), *map(bench.table_line, bench.with_means(rows))]))
     failed = any(row.outcome in ('failed', 'error') for row in rows)
