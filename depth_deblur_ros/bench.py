@@ -20,7 +20,7 @@ from depth_deblur_ros.core.geometry import warp
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
 from depth_deblur_ros.folders import read_frame, write_image, write_json, write_text
-from depth_deblur_ros.replay import motion_record
+from depth_deblur_ros.results import motion_record
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter

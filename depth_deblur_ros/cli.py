@@ -89,7 +89,7 @@ def _image_flags(parser: _Parser) -> None:
 def _image(args: argparse.Namespace) -> int:
     from depth_deblur_ros.core.solver import deblur
     from depth_deblur_ros.folders import read_frame, write_image, write_json
-    from depth_deblur_ros.replay import motion_record
+    from depth_deblur_ros.results import motion_record
 
     params = _solver_params(args)
     frame = read_frame(args.rgb, args.depth, args.camera)

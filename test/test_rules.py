@@ -54,7 +54,7 @@ def test_only_the_node_knows_ros():
 
 
 def test_only_bag_knows_the_bag_libraries():
-    assert importers({'mcap', 'mcap_ros2', 'rosbags'}) == {'bag.py'}
+    assert importers({'mcap', 'mcap_ros2', 'rosbags'}) == {'bag.py', 'mcap_file.py'}
 
 
 @pytest.mark.parametrize('path', CORE, ids=lambda p: p.name)
