@@ -1,8 +1,5 @@
 """Pairing against the nearest match over all messages."""
 
-import os
-from pathlib import Path
-
 from depth_deblur_ros.pairing import DUPLICATE, LATE, NO_DEPTH, StampPairer
 from hypothesis import given
 from hypothesis import strategies as st
@@ -94,11 +91,8 @@ def test_memory_is_bounded(kind):
     assert len(pairer._depth) <= 4
 
 
-def test_the_pairs_of_a_real_recording_are_its_association_file():
-    folder = os.environ.get('DEPTH_DEBLUR_DATA')
-    if not folder:
-        pytest.skip('DEPTH_DEBLUR_DATA is not set')
-    lines = (Path(folder) / 'tum_fr1_rpy/associations_windows.txt').read_text().splitlines()
+def test_the_pairs_of_a_real_recording_are_its_association_file(data):
+    lines = (data / 'tum_fr1_rpy/associations_windows.txt').read_text().splitlines()
     rows = [line.split() for line in lines if not line.startswith('#')]
     truth = [(_ns(row[0]), _ns(row[2])) for row in rows]
     messages = [(True, c) for c, _ in truth] + [(False, d) for d in {d for _, d in truth}]
