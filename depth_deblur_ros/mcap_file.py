@@ -166,14 +166,21 @@ class McapFile:
 
 def _opened(path: Path) -> BinaryIO:
     try:
-        stream: BinaryIO = path.open('rb')
-        if path.suffix == '.zstd':
-            with stream as packed:
-                stream = tempfile.TemporaryFile()  # noqa: SIM115 (McapFile.close closes it)
-                zstandard.ZstdDecompressor().copy_stream(packed, stream)
-        return stream
+        return _unpacked(path) if path.suffix == '.zstd' else path.open('rb')
     except (OSError, zstandard.ZstdError) as error:
         raise InputError(f'cannot read {path}: {error}') from error
+
+
+def _unpacked(path: Path) -> BinaryIO:
+    """Give the content of a packed file as a file that can be searched."""
+    plain: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 (McapFile.close closes it)
+    try:
+        with path.open('rb') as packed:
+            zstandard.ZstdDecompressor().copy_stream(packed, plain)
+    except BaseException:
+        plain.close()
+        raise
+    return plain
 
 
 def _records(opcode: int, data: bytes) -> Iterator[Any]:
