@@ -32,6 +32,7 @@ setup(
         'tqdm>=4.66',
         'rosbags>=0.11',
         'mcap>=1.2',
+        'zstandard>=0.22',
     ],
     extras_require={
         'ros': [

@@ -163,7 +163,7 @@ def table_line(row: Row) -> str:
 
 def write_tables(rows: Sequence[Row], results: Path) -> None:
     """Write RESULTS/table.json and RESULTS/table.md."""
-    write_json(results / 'table.json', [asdict(row) for row in rows])
+    write_json(results / 'table.json', {'cases': [asdict(row) for row in rows]})
     names = ['case', *(f.name for f in fields(Score)), 'seconds', 'outcome']
     lines = [f'| {" | ".join(names)} |', '|---' + '|--:' * (len(names) - 2) + '|---|']
     for row in with_means(rows):

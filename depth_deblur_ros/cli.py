@@ -22,7 +22,7 @@ from tqdm import tqdm
 import yaml
 
 DONE, SOME_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-PRESETS = ('tum_fr1', 'tum_fr2', 'tum_fr3')
+BAG_LIBRARIES = {'mcap', 'rosbags', 'zstandard'}  # a robot may lack them
 
 
 class _Parser(argparse.ArgumentParser):
@@ -48,11 +48,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         code: int = args.run(args)
         return code
     except (InputError, OSError) as error:
-        print(f'depth-deblur: {error}', file=sys.stderr)
-        return BAD_INPUT
+        return _refuse(str(error), BAD_INPUT)
+    except ModuleNotFoundError as error:
+        missing = str(error.name).split('.')[0]
+        if missing not in BAG_LIBRARIES:
+            raise
+        return _refuse(f'bags need {missing}: pip install {missing}', BAD_INPUT)
     except KeyboardInterrupt:
-        print('depth-deblur: interrupted', file=sys.stderr)
-        return INTERRUPTED
+        return _refuse('interrupted', INTERRUPTED)
+
+
+def _refuse(text: str, code: int) -> int:
+    print(f'depth-deblur: {text}', file=sys.stderr)
+    return code
 
 
 def replay_main() -> int:
@@ -130,12 +138,14 @@ def _import_flags(parser: _Parser) -> None:
     parser.add_argument('bag', type=Path, help='bag to write')
     camera = parser.add_mutually_exclusive_group()
     camera.add_argument('--camera', type=Path, help='camera.json (default: FOLDER/camera.json)')
-    camera.add_argument('--preset', choices=PRESETS, help='the published calibration of a camera')
+    camera.add_argument(
+        '--preset', metavar='tum_fr1|tum_fr2|tum_fr3', help='a calibration that TUM published'
+    )
     parser.add_argument('--overwrite', action='store_true', help='replace BAG if it is there')
 
 
 def _import_tum(args: argparse.Namespace) -> int:
-    from depth_deblur_ros.folders import import_tum
+    from depth_deblur_ros.tum import import_tum
 
     summary = import_tum(
         args.folder, args.bag, camera=args.camera, preset=args.preset, overwrite=args.overwrite
@@ -156,7 +166,7 @@ def _replay_flags(parser: _Parser) -> None:
         nargs='+',
         type=_topic,
         metavar='NAME=TOPIC',
-        help='where to find colour, depth, info (default: the usual names, else the only fit)',
+        help='for colour, depth, info, exposure (default: the usual names, else the only fit)',
     )
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='skip S seconds')
     parser.add_argument('--duration', type=float, metavar='S', help='stop after S seconds')
@@ -173,27 +183,38 @@ def _topic(text: str) -> tuple[str, str]:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    from depth_deblur_ros.folders import read_camera
     from depth_deblur_ros.replay import replay
 
     params = _solver_params(args)
-    with _bar('frame') as bar:
+    camera = read_camera(args.camera) if args.camera else None
+    exposure = camera.exposure if camera and args.exposure_s is None else args.exposure_s
+    with tqdm(unit='frame', disable=None) as bar:
         summary = replay(
             args.bag,
             args.out,
             params=params,
-            camera=args.camera,
-            exposure_s=args.exposure_s,
+            camera=camera.intrinsics if camera else None,
+            exposure_s=exposure,
             topics=dict(args.topics or ()),
             start=args.start,
             duration=args.duration,
             all_topics=args.all_topics,
             estimates=args.estimates,
-            progress=bar.progress,
+            progress=_progress(bar),
             on_frame=_painter(args.pictures) if args.pictures else None,
             overwrite=args.overwrite,
         )
     print(f'{args.out}: {summary}')
-    return SOME_FAILED if summary.failed else DONE
+    return DONE if summary.complete else SOME_FAILED
+
+
+def _progress(bar: tqdm[NoReturn]) -> Callable[[int, int | None], None]:
+    def show(done: int, total: int | None) -> None:
+        bar.total = total
+        bar.update(done - bar.n)
+
+    return show
 
 
 def _painter(folder: Path) -> Callable[[RgbdFrame, DeblurResult], None]:
@@ -207,11 +228,6 @@ def _painter(folder: Path) -> Callable[[RgbdFrame, DeblurResult], None]:
         write_image(folder / f'{next(numbers):05d}.png', draw_frame(frame, result))
 
     return paint
-
-
-def _bar(unit: str, total: int | None = None) -> tqdm[NoReturn]:
-    """Give a progress bar on a terminal, with frames per second and the remaining time."""
-    return tqdm(total=total, unit=unit, disable=not sys.stderr.isatty())
 
 
 def _solver_flags(parser: _Parser) -> None:

@@ -125,7 +125,7 @@ def test_a_broken_case_is_reported_and_the_others_go_on(tmp_path, fakes, capsys)
     shown = capsys.readouterr().out
     assert 'a-1' in shown and 'error: ' in shown and 'depth.png' in shown
     assert 'a MEAN (1)' in shown and 'b MEAN (1)' in shown
-    table = json.loads((tmp_path / 'out/table.json').read_text())
+    table = json.loads((tmp_path / 'out/table.json').read_text())['cases']
     assert [row['outcome'] for row in table] == ['error', 'solved', 'solved']
     assert '| a MEAN (1) |' in (tmp_path / 'out/table.md').read_text()
 

@@ -192,7 +192,7 @@ def test_depth_of_the_wrong_kind_is_refused(files, capsys, dtype):
     cv2.imwrite(str(path), np.full((48, 64), 20, dtype))
     path.rename(files / 'depth.png')
     line = refusal(image_command(files), capsys)
-    assert '16 bit' in line or 'uint16' in line
+    assert '16-bit' in line and np.dtype(dtype).name in line
 
 
 def test_an_output_that_cannot_be_written_is_refused(files, capsys):
