@@ -6,6 +6,7 @@ Richardson-Lucy is told the blur: one point-spread function for the whole image,
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 import time
@@ -58,7 +59,7 @@ def main() -> None:
     print(f'{frame.camera.width}x{frame.camera.height}, medians of {RUNS} runs')
     print(f'Richardson-Lucy, {STEPS} steps  {peer:7.2f} s')
     for mode in MODES:
-        own = seconds(lambda params=SolverParams(mode=mode): deblur(frame, params))
+        own = seconds(partial(deblur, frame, SolverParams(mode=mode)))
         print(f'deblur, {mode:<16}  {own:7.2f} s   {own / peer:5.2f} of Richardson-Lucy')
 
 
