@@ -91,7 +91,7 @@ def refused_result(image: FloatImage | None, depth: FloatImage | None) -> Deblur
 def motion_record(result: DeblurResult, stamp_ns: int, exposure: float | None) -> dict[str, Any]:
     """Give what stands in motion.json, and in one line of an estimates file."""
     return {
-        'stamp': stamp_ns / 1e9,
+        'stamp': stamp_ns / 1_000_000_000,  # of whole numbers: rounded once
         'theta': result.motion.theta.tolist(),
         'v': result.motion.v.tolist(),
         'covariance': result.motion.covariance.ravel().tolist(),
