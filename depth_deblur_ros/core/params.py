@@ -28,6 +28,9 @@ class SolverParams:
         'full', MODES, 'full: best image; fast: fewer image steps; motion: no image step'
     )
     threads: int = _knob(2, 1, 256, 'threads of the compiled kernels')
+    prior: float = _knob(2.7, 0.01, 100.0, 'weight of the image prior: more is smoother [c]')
+    reweightings: int = _knob(3, 1, 20, 'quadratic problems that the image step solves')
+    cg_steps: int = _knob(10, 1, 100, 'conjugate gradient steps in each of them')
 
     def __post_init__(self) -> None:
         for knob in knobs():

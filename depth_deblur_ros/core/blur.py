@@ -1,0 +1,211 @@
+"""
+The blur operator A of a known motion, and its exact adjoint.
+
+Notation: L (h, w, 3) latent image on the frame's grid widened by `margin` pixels on every side, because the
+blurred border shows what lies outside; B (H, W, 3) blurred image; t_i = (i + 0.5) / N - 0.5 the N instants of
+the exposure; w = 1 / Z inverse depth [1/m].
+B(x) = 1/N sum_i L(x - t_i (a(x) + w_i(x) b(x))), (5) of docs/method.md: a + w b is the first-order flow of the
+motion (geometry.py) and w_i(x) the inverse depth of the nearest surface that pixel x sees at t_i, so that near
+things hide far ones as they pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
+from depth_deblur_ros.core.geometry import flow
+from numba import get_num_threads, njit, prange
+import numpy as np
+import numpy.typing as npt
+
+MIN_SAMPLES, MAX_SAMPLES = 8, 128  # instants of one exposure; one per pixel of the longest blur between
+MIN_INVERSE_DEPTH = 1e-4  # 1/m; beyond 10 km nothing moves
+
+
+@dataclass(frozen=True, eq=False)
+class BlurOperator:
+    """A of (motion, depth, camera): apply (h, w, 3) -> (H, W, 3) and adjoint back."""
+
+    ray: npt.NDArray[np.float32]  # (H + W, ) xn of the columns, then yn of the rows
+    motion: npt.NDArray[np.float32]  # (8,): theta, v, fx, fy
+    inverse_depth: FloatImage  # (H, W, N) seen at each instant [1/m]
+    margin: int
+
+    @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        """(h, w, 3) of the latent image."""
+        height, width = self.inverse_depth.shape[:2]
+        return height + 2 * self.margin, width + 2 * self.margin, 3
+
+    def apply(self, latent: FloatImage) -> FloatImage:
+        """Blur: A L, (5) of docs/method.md."""
+        blurred = np.empty((*self.inverse_depth.shape[:2], 3), latent.dtype)
+        _gather(latent, self.inverse_depth, self.ray, self.motion, self.margin, blurred)
+        return blurred
+
+    def adjoint(self, blurred: FloatImage) -> FloatImage:
+        """A' B, so that <A L, B> = <L, A' B> to rounding."""
+        rows = self.inverse_depth.shape[0]
+        strips = min(get_num_threads(), rows)
+        height, width, _ = self.latent_shape
+        depth_of_strip = math.ceil(rows / strips) + 2 * self.margin
+        parts = np.zeros((strips, depth_of_strip, width, 3), blurred.dtype)
+        _scatter(blurred, self.inverse_depth, self.ray, self.motion, self.margin, parts)
+        latent = np.zeros((height, width, 3), blurred.dtype)
+        for k in range(strips):
+            first = k * rows // strips
+            last = min(first + depth_of_strip, height)
+            latent[first:last] += parts[k, : last - first]
+        return latent
+
+    def widen(self, image: FloatImage) -> FloatImage:
+        """Continue an image (H, W, ...) over the margin by its border pixels."""
+        pad = [(self.margin, self.margin)] * 2 + [(0, 0)] * (image.ndim - 2)
+        return np.pad(image, pad, 'edge')
+
+    def crop(self, latent: FloatImage) -> FloatImage:
+        """Cut a latent image back to the frame."""
+        height, width = self.inverse_depth.shape[:2]
+        m = self.margin
+        return np.ascontiguousarray(latent[m : m + height, m : m + width])
+
+
+def blur_operator(motion: Motion, depth: FloatImage, camera: CameraIntrinsics) -> BlurOperator:
+    """Build A for a motion over the exposure; depth (H, W) filled [m]."""
+    f = flow(motion.vector, depth, camera)
+    longest = float(np.hypot(f[..., 0], f[..., 1]).max())
+    samples = int(np.clip(math.ceil(longest), MIN_SAMPLES, MAX_SAMPLES))
+    reach = math.ceil(float(np.abs(f).max()) / 2)
+    cols = (np.arange(camera.width) - camera.cx) / camera.fx
+    rows = (np.arange(camera.height) - camera.cy) / camera.fy
+    ray = np.concatenate([cols, rows]).astype(np.float32)
+    vector = np.concatenate([motion.vector, [camera.fx, camera.fy]]).astype(np.float32)
+    nearness = np.maximum(1 / depth, np.float32(MIN_INVERSE_DEPTH)).astype(np.float32)
+    seen = np.empty((*depth.shape, samples), np.float32)
+    _see(nearness, ray, vector, f, seen)
+    # Two more pixels: one for the interpolation, one for what comes nearer during the exposure.
+    return BlurOperator(ray, vector, seen, reach + 2)
+
+
+@njit(cache=True, nogil=True)
+def _instant(i: int, samples: int) -> float:
+    return np.float32((i + 0.5) / samples - 0.5)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _see(nearness, ray, motion, f, seen):  # type: ignore[no-untyped-def]
+    """Warp the inverse depth to each instant: the nearest surface wins, what it uncovers is far."""
+    height, width, samples = seen.shape
+    for i in prange(samples):
+        t = _instant(i, samples)
+        view = np.zeros((height, width), np.float32)
+        for y in range(height):
+            for x in range(width):
+                w = nearness[y, x]
+                grow = 1 + t * (motion[0] * ray[width + y] - motion[1] * ray[x] + motion[5] * w)
+                near = w / max(grow, np.float32(0.1))
+                px, py = x + t * f[y, x, 0], y + t * f[y, x, 1]
+                x0, y0 = int(math.floor(px)), int(math.floor(py))
+                for yy in range(max(y0, 0), min(y0 + 2, height)):
+                    for xx in range(max(x0, 0), min(x0 + 2, width)):
+                        if near > view[yy, xx]:
+                            view[yy, xx] = near
+        _fill_uncovered(view, nearness)
+        for y in range(height):
+            for x in range(width):
+                seen[y, x, i] = view[y, x]
+
+
+@njit(cache=True, nogil=True)
+def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
+    """Give uncovered pixels (0) the farther of their row's next surfaces; an empty row stays at rest."""
+    height, width = view.shape
+    for y in range(height):
+        x = 0
+        while x < width:
+            if view[y, x] > 0:
+                x += 1
+                continue
+            end = x
+            while end < width and view[y, end] == 0:
+                end += 1
+            left = view[y, x - 1] if x > 0 else np.float32(np.inf)
+            right = view[y, end] if end < width else np.float32(np.inf)
+            far = min(left, right)
+            for k in range(x, end):
+                view[y, k] = far if far < np.inf else nearness[y, k]
+            x = end
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _source(x, y, i, seen, ax, ay, bx, by, margin, height, width):  # type: ignore[no-untyped-def]
+    """Give the latent cell and the four bilinear weights that pixel (x, y) reads at instant i."""
+    t = _instant(i, seen.shape[2])
+    w = seen[y, x, i]
+    px = x + margin - t * (ax + w * bx)
+    py = y + margin - t * (ay + w * by)
+    px = min(max(px, np.float32(0)), np.float32(width - 1.001))
+    py = min(max(py, np.float32(0)), np.float32(height - 1.001))
+    x0, y0 = int(px), int(py)
+    u, v = np.float32(px - x0), np.float32(py - y0)
+    one = np.float32(1)
+    return x0, y0, (one - u) * (one - v), u * (one - v), (one - u) * v, u * v
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _flow_parts(x, y, ray, width, m):  # type: ignore[no-untyped-def]
+    """Give a and b of the flow a + w b at a pixel, (3) of docs/method.md."""
+    xn, yn = ray[x], ray[width + y]
+    one = np.float32(1)
+    ax = m[6] * (-xn * yn * m[0] + (one + xn * xn) * m[1] - yn * m[2])
+    ay = m[7] * (-(one + yn * yn) * m[0] + xn * yn * m[1] + xn * m[2])
+    return ax, ay, m[6] * (m[3] - xn * m[5]), m[7] * (m[4] - yn * m[5])
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _gather(latent, seen, ray, motion, margin, blurred):  # type: ignore[no-untyped-def]
+    height, width, samples = seen.shape
+    high, wide = latent.shape[:2]
+    share = np.float32(1.0 / samples)
+    for y in prange(height):
+        for x in range(width):
+            ax, ay, bx, by = _flow_parts(x, y, ray, width, motion)
+            r = g = b = latent[0, 0, 0] * 0
+            for i in range(samples):
+                x0, y0, w00, w01, w10, w11 = _source(
+                    x, y, i, seen, ax, ay, bx, by, margin, high, wide
+                )
+                p, q = latent[y0], latent[y0 + 1]
+                r += w00 * p[x0, 0] + w01 * p[x0 + 1, 0] + w10 * q[x0, 0] + w11 * q[x0 + 1, 0]
+                g += w00 * p[x0, 1] + w01 * p[x0 + 1, 1] + w10 * q[x0, 1] + w11 * q[x0 + 1, 1]
+                b += w00 * p[x0, 2] + w01 * p[x0 + 1, 2] + w10 * q[x0, 2] + w11 * q[x0 + 1, 2]
+            blurred[y, x, 0], blurred[y, x, 1], blurred[y, x, 2] = share * r, share * g, share * b
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _scatter(blurred, seen, ray, motion, margin, parts):  # type: ignore[no-untyped-def]
+    """Spread each blurred pixel over what it read; strip k of rows writes to parts[k] alone."""
+    height, width, samples = seen.shape
+    wide = parts.shape[2]
+    share = np.float32(1.0 / samples)
+    strips = parts.shape[0]
+    for k in prange(strips):
+        first, end = np.int64(k) * height // strips, np.int64(k + 1) * height // strips
+        part = parts[k]
+        for y in range(first, end):
+            for x in range(width):
+                ax, ay, bx, by = _flow_parts(x, y, ray, width, motion)
+                r, g, b = blurred[y, x, 0], blurred[y, x, 1], blurred[y, x, 2]
+                spread = (share * r, share * g, share * b)
+                for i in range(samples):
+                    x0, y0, w00, w01, w10, w11 = _source(
+                        x, y, i, seen, ax, ay, bx, by, margin, height + 2 * margin, wide
+                    )
+                    p, q = part[y0 - first], part[y0 + 1 - first]
+                    for c in range(3):
+                        p[x0, c] += w00 * spread[c]
+                        p[x0 + 1, c] += w01 * spread[c]
+                        q[x0, c] += w10 * spread[c]
+                        q[x0 + 1, c] += w11 * spread[c]

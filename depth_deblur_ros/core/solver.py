@@ -1,0 +1,106 @@
+"""
+The page that tells the algorithm: from one blurred RGB-D frame to the sharp image and the motion.
+
+1 fill the depth map's holes, guided by the colours (depth.py)
+2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or find that there
+  is no blur or nothing to trust: then the frame passes unchanged
+3 restore the image under that motion (latent.py), with near things passing before far ones (blur.py)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import time
+
+import cv2
+from depth_deblur_ros.core.blur import blur_operator
+from depth_deblur_ros.core.data import DeblurResult, FloatImage, Motion, Outcome, RgbdFrame
+from depth_deblur_ros.core.depth import fill_depth
+from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.latent import LatentSteps, noise_sigma, restore_latent
+from depth_deblur_ros.core.params import SolverParams
+from depth_deblur_ros.core.start import blind_start
+from numba import config, get_num_threads, set_num_threads
+import numpy as np
+
+
+def deblur(
+    frame: RgbdFrame, params: SolverParams | None = None, *, start: Motion | None = None
+) -> DeblurResult:
+    """
+    Find the sharp image and the camera's motion during the exposure of one frame.
+
+    start: a further motion to start from (the previous frame's, say). Pure: the same input gives the same
+    output, but for seconds. One image cannot tell the sign of the motion, so sign_resolved is False unless
+    there is no motion. Raises InputError when all depth is missing.
+    """
+    params = params or SolverParams()
+    began = time.monotonic()
+    with _threads(params.threads):
+        depth = fill_depth(frame.depth, frame.image, threads=params.threads)
+        first = blind_start(_grey(frame.image), depth, frame.camera, start)
+        image = frame.image
+        if first.outcome is Outcome.SOLVED and params.mode != 'motion':
+            image = _restore(frame, depth, first.motion, params)
+    return DeblurResult(
+        image=image,
+        depth=depth,
+        motion=first.motion,
+        outcome=first.outcome,
+        sign_resolved=first.outcome is Outcome.SHARP,
+        quality=first.quality,
+        blur_px=blur_length(first.motion.vector, depth, frame.camera),
+        seconds=time.monotonic() - began,
+    )
+
+
+def restore_known(
+    frame: RgbdFrame, motion: Motion, params: SolverParams | None = None
+) -> DeblurResult:
+    """Restore the image under a known motion: the limit of what any estimate of the motion can reach."""
+    params = params or SolverParams()
+    began = time.monotonic()
+    with _threads(params.threads):
+        depth = fill_depth(frame.depth, frame.image, threads=params.threads)
+        image = _restore(frame, depth, motion, params)
+    return DeblurResult(
+        image=image,
+        depth=depth,
+        motion=motion,
+        outcome=Outcome.SOLVED,
+        sign_resolved=True,
+        quality=1.0,
+        blur_px=blur_length(motion.vector, depth, frame.camera),
+        seconds=time.monotonic() - began,
+    )
+
+
+def _restore(
+    frame: RgbdFrame, depth: FloatImage, motion: Motion, params: SolverParams
+) -> FloatImage:
+    """Run the image step on a colour or grey frame."""
+    grey = frame.image.ndim == 2
+    colour = np.repeat(frame.image[..., None], 3, 2) if grey else frame.image
+    blur = blur_operator(motion, depth, frame.camera)
+    outer = 1 if params.mode == 'fast' else params.reweightings
+    steps = LatentSteps(params.prior, outer, params.cg_steps)
+    sharp = restore_latent(colour, blur, frame.camera.transfer, noise_sigma(colour), steps)
+    return np.ascontiguousarray(sharp[..., 0]) if grey else sharp
+
+
+def _grey(image: FloatImage) -> FloatImage:
+    return image if image.ndim == 2 else image.mean(2)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Run the kernels and OpenCV on this many threads, and give the process back as it was."""
+    kernels, vision = get_num_threads(), cv2.getNumThreads()
+    set_num_threads(min(count, config.NUMBA_NUM_THREADS))
+    cv2.setNumThreads(count)
+    try:
+        yield
+    finally:
+        set_num_threads(kernels)
+        cv2.setNumThreads(vision)

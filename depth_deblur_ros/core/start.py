@@ -1,0 +1,196 @@
+"""
+The blind start: where the first motion comes from, out of one blurred image.
+
+The score S (evidence.py) is computed at full, half and quarter scale. Each scale proposes motions, from a grid
+over shifts, roll and zoom and from random ones with parallax, refined by a shrinking search; all scales
+together choose, since a false optimum at one scale seldom is one at the next. docs/method.md (11) to (13).
+
+Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes); length = mean blur [px].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Outcome, Vector
+from depth_deblur_ros.core.evidence import (
+    Evidence,
+    gather_evidence,
+    motion_axes,
+    PATCH,
+    REACH,
+    scores,
+)
+from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.trust import covariance_from_curvature, sharpness
+import numpy as np
+
+SCALES = (1, 2, 4)
+SHARE = {1: 1.0, 2: 0.5, 4: 0.25}  # of a scale in the common score: coarse bands are deep but inexact
+PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
+SEEDS = 8  # distinct motions that each scale refines
+SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
+ROUNDS, TRIES, SHRINK = 14, 200, 0.78
+SATURATED = 0.98
+SHORTEST = 1.5  # px; below, a motion is not told from the lens's own blur
+SHORT = 8.0  # px; up to here only the full scale sees bands at all
+SHORT_TRUST = 0.08  # least -S at full scale of a short blur
+LONG_TRUST = 0.18  # least common -S of a long blur
+CLEARLY_SHARP, RATHER_SHARP = 1.15, 1.065  # trust.sharpness: nothing to search; no motion and no blur
+BELIEF = 0.3  # common -S at which a motion is taken for certain
+OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
+PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
+BEND = 1.0  # px, step of the second differences
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """The first motion p (6,) (zero unless solved), what it is worth, and its covariance."""
+
+    motion: Motion
+    outcome: Outcome
+    quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """One scale of the search: its evidence and its factor."""
+
+    factor: int
+    evidence: Evidence
+
+
+def blind_start(
+    grey: FloatImage,
+    depth: FloatImage,
+    camera: CameraIntrinsics,
+    guess: Motion | None = None,
+) -> Start:
+    """
+    Find the motion from one grey image (H, W), stored values 0..1, and its filled depth (H, W) [m].
+
+    guess: a further motion to start from. The sign of the answer is arbitrary: p and -p blur alike.
+    """
+    axes = motion_axes(depth, camera)
+    if sharpness(grey) > CLEARLY_SHARP:
+        return _nothing(Outcome.SHARP, axes)
+    scales = _scales(grey, depth, camera, axes)
+    q = _search(scales, None if guess is None else np.linalg.solve(axes, guess.vector))
+    length = blur_length(axes @ q, depth, camera)
+    if not _trusted(q, length, scales):
+        sharp = sharpness(grey) > RATHER_SHARP
+        return _nothing(Outcome.SHARP if sharp else Outcome.FAILED, axes)
+    quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
+    return Start(Motion.from_vector(axes @ q, _covariance(q, scales, axes)), Outcome.SOLVED, quality)
+
+
+def _trusted(q: Vector, length: float, scales: list[Scale]) -> bool:
+    """Tell whether the bands are deep enough for a blur of this length [px]."""
+    if length < SHORTEST:
+        return False
+    if length < SHORT:
+        return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
+    return bool(common_score(q[None], scales)[0] < -LONG_TRUST)
+
+
+def _nothing(outcome: Outcome, axes: Vector) -> Start:
+    """Give no motion: still to within SHORTEST when sharp, unknown to within the prior when failed."""
+    spread = SHORTEST / 2 if outcome is Outcome.SHARP else PRIOR_PX
+    covariance = spread**2 * axes @ axes.T
+    quality = 1.0 if outcome is Outcome.SHARP else 0.0
+    return Start(Motion.from_vector(np.zeros(6), covariance), outcome, quality)
+
+
+def _covariance(q: Vector, scales: list[Scale], axes: Vector) -> Vector:
+    """Give the covariance (6, 6) of p from how S^2 / 2 bends around q."""
+    steps = BEND * np.eye(6)
+    tries = [q + a * steps[i] + b * steps[j] for i in range(6) for j in range(6) for a, b in _SIGNS]
+    value = np.square(np.minimum(common_score(np.array(tries), scales), 0)) / 2
+    bend = -(value.reshape(6, 6, 4) @ np.array([1, -1, -1, 1])) / (4 * BEND**2)
+    return np.asarray(axes @ covariance_from_curvature(bend, OBSERVATIONS, PRIOR_PX) @ axes.T)
+
+
+_SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+def _scales(
+    grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+) -> list[Scale]:
+    """Gather the evidence of every scale that still holds a patch each way."""
+    whole = _whole(grey)
+    found = []
+    for factor in SCALES:
+        width, height = camera.width // factor, camera.height // factor
+        if min(width, height) < PATCH and found:
+            break
+        small = [cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (grey, whole)]
+        near = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
+        evidence = gather_evidence(small[0], small[1], near, camera.scaled(width, height), axes)
+        found.append(Scale(factor, evidence))
+    return found
+
+
+def _whole(grey: FloatImage) -> FloatImage:
+    """Give 1 where the pixel and its neighbourhood are not saturated, softly falling to 0."""
+    burnt = cv2.GaussianBlur((grey > SATURATED).astype(np.float32), (0, 0), 3)
+    return np.clip(1 - 2 * burnt, 0, 1)
+
+
+def common_score(qs: Vector, scales: list[Scale]) -> Vector:
+    """Give the score (m,) of motions q (m, 6) over all scales, with the price of parallax."""
+    total = PARALLAX_COST * (qs[:, 4] ** 2 + qs[:, 5] ** 2)
+    for scale in scales:
+        total = total + SHARE[scale.factor] * scores(qs, scale.evidence)
+    return np.asarray(total)
+
+
+def _search(scales: list[Scale], guess: Vector | None) -> Vector:
+    """Let each scale propose and all choose; q (6,)."""
+    found = [] if guess is None else [guess]
+    for scale in scales:
+        for seed in _seeds(scale):
+            found.append(_refine(seed, [scale], 2.0 * scale.factor))
+    best = found[int(np.argmin(common_score(np.array(found), scales)))]
+    return _refine(best, scales, 1.0)
+
+
+@lru_cache(maxsize=1)
+def _proposals() -> Vector:
+    """Give motions (m, 6) [px] all over what one scale can see: a grid, and random ones with parallax."""
+    steps = np.arange(-REACH + 2, REACH - 1, 2.0)
+    grid = np.stack(
+        np.meshgrid(steps, steps[steps >= 0], np.linspace(-18, 18, 7), np.linspace(-12, 12, 5)), -1
+    ).reshape(-1, 4)
+    grid = np.concatenate([grid, np.zeros((len(grid), 2))], 1)
+    random = np.random.default_rng(0).standard_normal((30000, 6)) * (14, 14, 7, 6, 3, 3)
+    return np.concatenate([grid, random])
+
+
+def _seeds(scale: Scale) -> list[Vector]:
+    """Pick the best proposals of a scale that differ by more than 4 of its pixels."""
+    qs = _proposals() * scale.factor
+    order = np.argsort(common_score(qs, [scale]))[:3000]
+    chosen: list[Vector] = []
+    for k in order:
+        if all(np.abs(qs[k] - other).max() > 4 * scale.factor for other in chosen):
+            chosen.append(qs[k])
+        if len(chosen) == SEEDS:
+            break
+    return chosen
+
+
+def _refine(q: Vector, scales: list[Scale], radius: float) -> Vector:
+    """Shrinking random search around q, the same each time; radius [px]."""
+    rng = np.random.default_rng(0)
+    spread = radius * np.array(SPREAD)
+    best = common_score(q[None], scales)[0]
+    for _ in range(ROUNDS):
+        tries = q + rng.standard_normal((TRIES, 6)) * spread
+        values = common_score(tries, scales)
+        k = int(np.argmin(values))
+        if values[k] < best:
+            best, q = values[k], tries[k]
+        spread = SHRINK * spread
+    return q

@@ -1,0 +1,69 @@
+"""
+Whether to believe a motion, and how much.
+
+One image must first show that it is blurred at all: a sharp picture gives a wild answer, too. Three witnesses:
+the depth of the dark bands at the found motion (evidence.py), its repetition at the next scale, and how fast
+differences fade when the image is blurred a little further. docs/method.md (13), (14).
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+from depth_deblur_ros.core.data import FloatImage, Vector
+import numpy as np
+import numpy.typing as npt
+
+DIRECTIONS = 8
+FURTHER = 3.0  # px of further blur
+
+
+def sharpness(grey: FloatImage) -> float:
+    """
+    Give how much further blur along the blurriest direction weakens the strongest tenth of the edges.
+
+    1 = not at all: long motion blur along that direction; 1.1 and more: no blur longer than 2 px.
+    """
+    smooth = cv2.GaussianBlur(grey, (0, 0), 0.6)
+    ratios = []
+    for k in range(DIRECTIONS):
+        angle = math.pi * k / DIRECTIONS
+        near = _difference(smooth, angle, 1.0)
+        far = _difference(smooth, angle, FURTHER) / np.float32(FURTHER)
+        strong = np.abs(near) >= np.percentile(np.abs(near), 90)
+        ratios.append(float(_rms(near[strong]) / max(_rms(far[strong]), 1e-9)))
+    return min(ratios)
+
+
+def _difference(image: FloatImage, angle: float, length: float) -> FloatImage:
+    """Give I(x + d/2) - I(x - d/2) for d of this length [px] and angle; borders repeat."""
+    half = 0.5 * length * np.array([math.cos(angle), math.sin(angle)])
+    ahead, behind = (_shifted(image, sign * half) for sign in (1, -1))
+    return ahead - behind
+
+
+def _shifted(image: FloatImage, shift: npt.NDArray[np.float64]) -> FloatImage:
+    matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    size = (image.shape[1], image.shape[0])
+    moved = cv2.warpAffine(
+        image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(moved, np.float32)
+
+
+def _rms(values: FloatImage) -> float:
+    return float(np.sqrt(np.square(values, dtype=np.float64).mean())) if values.size else 0.0
+
+
+def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -> Vector:
+    """
+    Give the covariance (6, 6) [px^2] of q where S^2 / 2 bends by -curvature (6, 6).
+
+    gain: how many independent observations S^2 is made of; directions that the image does not show keep the
+    prior's spread.
+    """
+    information = gain * (curvature + curvature.T) / 2
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, 0) + 1 / prior_px**2
+    return np.asarray(vectors / values @ vectors.T)
