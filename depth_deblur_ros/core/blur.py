@@ -1,12 +1,14 @@
 """
 The blur operator A of a known motion, and its exact adjoint.
 
-Notation: L (h, w, 3) latent image on the frame's grid widened by `margin` pixels on every side, because the
-blurred border shows what lies outside; B (H, W, 3) blurred image; t_i = (i + 0.5) / N - 0.5 the N instants of
-the exposure; w = 1 / Z inverse depth [1/m].
-B(x) = 1/N sum_i L(x - t_i (a(x) + w_i(x) b(x))), (5) of docs/method.md: a + w b is the first-order flow of the
-motion (geometry.py) and w_i(x) the inverse depth of the nearest surface that pixel x sees at t_i, so that near
-things hide far ones as they pass.
+Notation: L (h, w, 3) latent image on the frame's grid widened by `margin` pixels on every side,
+because the blurred border shows what lies outside; B (H, W, 3) blurred image;
+t_i = (i + 0.5) / N - 0.5 the N instants of the exposure; w = 1 / Z inverse depth [1/m].
+
+    B(x) = 1/N sum_i L(x - t_i (a(x) + w_i(x) b(x))),    (5) of docs/method.md
+
+where a + w b is the first-order flow of the motion (geometry.py) and w_i(x) the inverse depth of
+the nearest surface that pixel x sees at t_i, so that near things hide far ones as they pass.
 """
 
 from __future__ import annotations
@@ -20,7 +22,10 @@ from numba import get_num_threads, njit, prange
 import numpy as np
 import numpy.typing as npt
 
-MIN_SAMPLES, MAX_SAMPLES = 8, 128  # instants of one exposure; one per pixel of the longest blur between
+MIN_SAMPLES, MAX_SAMPLES = (
+    8,
+    128,
+)  # instants of one exposure; one per pixel of the longest blur between
 MIN_INVERSE_DEPTH = 1e-4  # 1/m; beyond 10 km nothing moves
 
 
@@ -46,7 +51,7 @@ class BlurOperator:
         return blurred
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
-        """A' B, so that <A L, B> = <L, A' B> to rounding."""
+        """Give A' B, so that <A L, B> = <L, A' B> to rounding."""
         rows = self.inverse_depth.shape[0]
         strips = min(get_num_threads(), rows)
         height, width, _ = self.latent_shape
@@ -90,13 +95,13 @@ def blur_operator(motion: Motion, depth: FloatImage, camera: CameraIntrinsics) -
 
 
 @njit(cache=True, nogil=True)
-def _instant(i: int, samples: int) -> float:
+def _instant(i, samples):  # type: ignore[no-untyped-def]
     return np.float32((i + 0.5) / samples - 0.5)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _see(nearness, ray, motion, f, seen):  # type: ignore[no-untyped-def]
-    """Warp the inverse depth to each instant: the nearest surface wins, what it uncovers is far."""
+    """Warp the inverse depth to each instant: the nearest wins, what it uncovers is far."""
     height, width, samples = seen.shape
     for i in prange(samples):
         t = _instant(i, samples)
@@ -110,8 +115,7 @@ def _see(nearness, ray, motion, f, seen):  # type: ignore[no-untyped-def]
                 x0, y0 = int(math.floor(px)), int(math.floor(py))
                 for yy in range(max(y0, 0), min(y0 + 2, height)):
                     for xx in range(max(x0, 0), min(x0 + 2, width)):
-                        if near > view[yy, xx]:
-                            view[yy, xx] = near
+                        view[yy, xx] = max(view[yy, xx], near)
         _fill_uncovered(view, nearness)
         for y in range(height):
             for x in range(width):
@@ -140,14 +144,14 @@ def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _source(x, y, i, seen, ax, ay, bx, by, margin, height, width):  # type: ignore[no-untyped-def]
-    """Give the latent cell and the four bilinear weights that pixel (x, y) reads at instant i."""
+def _source(x, y, i, seen, ax, ay, bx, by, m, high, wide):  # type: ignore[no-untyped-def]
+    """Give the latent cell and the bilinear weights that pixel (x, y) reads at instant i."""
     t = _instant(i, seen.shape[2])
     w = seen[y, x, i]
-    px = x + margin - t * (ax + w * bx)
-    py = y + margin - t * (ay + w * by)
-    px = min(max(px, np.float32(0)), np.float32(width - 1.001))
-    py = min(max(py, np.float32(0)), np.float32(height - 1.001))
+    px = x + m - t * (ax + w * bx)
+    py = y + m - t * (ay + w * by)
+    px = min(max(px, np.float32(0)), np.float32(wide - 1.001))
+    py = min(max(py, np.float32(0)), np.float32(high - 1.001))
     x0, y0 = int(px), int(py)
     u, v = np.float32(px - x0), np.float32(py - y0)
     one = np.float32(1)

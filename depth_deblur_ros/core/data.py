@@ -1,14 +1,14 @@
 """
 What goes in and out of the solver: frozen records, checked when made, then trusted.
 
-Frames and units: the camera's optical frame (REP 103: x right, y down, z forward), metres, radians,
-seconds. Pixel centres lie at integers.
+Frames and units: the camera's optical frame (REP 103: x right, y down, z forward), metres,
+radians, seconds. Pixel centres lie at integers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import Enum
+from enum import StrEnum
 import math
 from typing import Any
 
@@ -28,7 +28,7 @@ class InputError(ValueError):
     """Something given from outside cannot work; the text names the value and the limit."""
 
 
-class Outcome(str, Enum):
+class Outcome(StrEnum):
     """What became of a frame."""
 
     SHARP = 'sharp'  # no blur found: image unchanged, motion zero
@@ -41,9 +41,9 @@ class CameraIntrinsics:
     """
     A pinhole camera of a rectified image.
 
-    fx, fy, cx, cy in pixels; width, height in pixels; distortion plumb_bob [k1 k2 p1 p2 k3] or None
-    (rectified); transfer names the space in which the stored values add up light: 'srgb' (undo the sRGB
-    curve first) or 'linear' (as they are).
+    fx, fy, cx, cy in pixels; width, height in pixels; distortion plumb_bob [k1 k2 p1 p2 k3] or
+    None (rectified); transfer names the space in which the stored values add up light: 'srgb'
+    (undo the sRGB curve first) or 'linear' (as they are).
     """
 
     fx: float
@@ -74,7 +74,7 @@ class CameraIntrinsics:
             raise InputError(f'transfer must be one of {TRANSFERS}, got {self.transfer!r}')
 
     def scaled(self, width: int, height: int) -> CameraIntrinsics:
-        """Give the same camera for the image resized to width x height (pixel centres at integers)."""
+        """Give the same camera for the image resized to width x height."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -121,8 +121,8 @@ class Motion:
     """
     The camera's motion over the whole exposure, as it moves the scene.
 
-    A scene point X given in the camera frame at mid-exposure is at R(t theta) X + t v at time
-    t in [-1/2, 1/2] (the paper's p_t = (t / 2T) p). theta (3,) rad, v (3,) m, covariance (6, 6) in the
+    A scene point X given in the camera frame at mid-exposure is at R(t theta) X + t v at time t in
+    [-1/2, 1/2] (the paper's p_t = (t / 2T) p). theta (3,) rad, v (3,) m, covariance (6, 6) in the
     order theta, v. The camera's own velocity is -theta / exposure, -v / exposure.
     """
 
@@ -164,8 +164,8 @@ class DeblurResult:
     """
     What the solver says about one frame.
 
-    image as in RgbdFrame (unchanged unless solved); depth (H, W) float32, filled, no NaN; quality 0..1, the
-    trust in the motion; blur_px the mean length of the blur [px]; seconds spent.
+    image as in RgbdFrame (unchanged unless solved); depth (H, W) float32, filled, no NaN; quality
+    0..1, the trust in the motion; blur_px the mean length of the blur [px]; seconds spent.
     """
 
     image: FloatImage
@@ -205,7 +205,9 @@ def _check_focal(name: str, value: Any, width: int) -> None:
 
 def _check_distortion(values: Any) -> None:
     if len(values) not in (4, 5) or not all(_is_number(k) for k in values):
-        raise InputError(f'distortion must be 4 or 5 finite numbers k1 k2 p1 p2 [k3], got {values}')
+        raise InputError(
+            f'distortion must be 4 or 5 finite numbers k1 k2 p1 p2 [k3], got {values}'
+        )
 
 
 def _check_image(image: Any) -> None:

@@ -1,14 +1,17 @@
 """
 What the spectra of patches say about a motion: the score that the blind start searches.
 
-A straight blur by u pixels multiplies the spectrum of a patch by sinc(f.u): its dark bands stand out of the
-log-spectrum whatever the scene is. All patches together say which motion p explains their bands, by a matched
-filter that is normalised, so that a template without bands cannot win, docs/method.md (8) to (11).
+A straight blur by u pixels multiplies the spectrum of a patch by sinc(f.u): its dark bands stand
+out of the log-spectrum whatever the scene is. All patches together say which motion p explains
+their bands, by a matched filter that is normalised, so that a template without bands cannot win,
+docs/method.md (8) to (11).
 
-Notation: f spatial frequency [cycles/px]; u (2,) flow of a patch over the exposure [px]; y_b log-spectrum of
-patch b and T_u template, both without what scenes have by themselves (a power law and a strength for each
-direction); C_b(u) = <y_b, T_u> / n; D(u) = |T_u|^2 / n; p = G q motion, q (6,) in pixels (see _axes).
-S(p) = -sum_b w_b C_b(J_b p) / sqrt(sum_b w_b D(J_b p) + 0.2), the lower the better.
+Notation: f spatial frequency [cycles/px]; u (2,) flow of a patch over the exposure [px];
+y_b log-spectrum of patch b and T_u template, both without what scenes have by themselves (a power
+law and a strength for each direction); C_b(u) = <y_b, T_u> / n; D(u) = |T_u|^2 / n;
+p = G q motion, q (6,) in pixels (motion_axes).
+
+    S(p) = -sum_b w_b C_b(J_b p) / sqrt(sum_b w_b D(J_b p) + 0.2),    the lower the better
 """
 
 from __future__ import annotations
@@ -25,7 +28,9 @@ import numpy.typing as npt
 
 PATCH = 96  # px
 STEP = 48  # px between patches
-REACH = 56  # px; longest flow of the table along each axis; longer blurs are seen at coarser scales
+REACH = (
+    56  # px; longest flow of the table along each axis; longer blurs are seen at coarser scales
+)
 SECTORS = 24  # directions in which a scene may be strong or weak by itself
 BAND = (2.5 / PATCH, 0.25)  # cycles/px: above the window's own width, below the lens's blur
 FLOOR = 0.05  # how deep the dark bands are filled by noise and by neighbours in the window
@@ -36,7 +41,7 @@ MAX_PATCHES = 400
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Templates of all flows on a grid of 1 px: rows v = 0..REACH, columns u = -REACH..REACH."""
+    """Templates of all flows, 1 px apart: rows v = 0..REACH, columns u = -REACH..REACH."""
 
     bins: npt.NDArray[np.intp]  # (n,) flat indices into the half spectrum
     nuisance: FloatImage  # (n, k) orthonormal
@@ -46,7 +51,7 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the patches of one scale say: C (B, rows, columns), D, weights w (B,), J G (B, 2, 6)."""
+    """What the patches of one scale say: C (B, rows, columns), D, w (B,), J G (B, 2, 6)."""
 
     match: FloatImage
     energy: FloatImage
@@ -74,8 +79,10 @@ def template_table() -> Table:
     return Table(bins, nuisance, t, energy.astype(np.float32))
 
 
-def _templates(fx: Vector, fy: Vector, bins: npt.NDArray[np.intp], us: Vector, v: float) -> FloatImage:
-    """Give log-spectra (n, len(us)) of straight blurs (u, v), smeared by the window's own spectrum."""
+def _templates(
+    fx: Vector, fy: Vector, bins: npt.NDArray[np.intp], us: Vector, v: float
+) -> FloatImage:
+    """Give log-spectra (n, len(us)) of straight blurs (u, v), smeared by the window."""
     spectra = np.sinc(fx[None] * us[:, None, None] + fy[None] * v) ** 2
     # The half spectrum is continued by its mirror image: S(-f) = S(f).
     left = np.roll(spectra[:, ::-1, 1:2], 1, axis=1)
@@ -83,7 +90,7 @@ def _templates(fx: Vector, fy: Vector, bins: npt.NDArray[np.intp], us: Vector, v
     wide = (wide[:, :, :-2] + 4 * wide[:, :, 1:-1] + wide[:, :, 2:]) / 6
     wide = (np.roll(wide, 1, 1) + 4 * wide + np.roll(wide, -1, 1)) / 6
     logs = np.log(wide + FLOOR).reshape(len(us), -1)[:, bins]
-    return logs.T.astype(np.float32)
+    return np.asarray(logs.T, np.float32)
 
 
 def gather_evidence(
@@ -129,7 +136,8 @@ def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
 
 def _differences(grey: FloatImage) -> tuple[FloatImage, FloatImage]:
     kernel = np.array([[-0.5, 0, 0.5]], np.float32)
-    return cv2.filter2D(grey, -1, kernel), cv2.filter2D(grey, -1, kernel.T.copy())
+    gx, gy = cv2.filter2D(grey, -1, kernel), cv2.filter2D(grey, -1, kernel.T.copy())
+    return np.asarray(gx, np.float32), np.asarray(gy, np.float32)
 
 
 def _flow_of_q(
@@ -150,8 +158,9 @@ def motion_axes(depth: FloatImage, camera: CameraIntrinsics) -> Vector:
     """
     Give G (6, 6): p = G q with q in pixels: two shifts, roll, zoom, and two parallaxes.
 
-    A shift is a rotation that moves the middle by 1 px, roll and zoom move the corner by 1 px, a parallax is a
-    translation with the rotation that keeps the mean depth in place, scaled so that depth's spread moves 1 px.
+    A shift is a rotation that moves the middle by 1 px, roll and zoom move the corner by 1 px, a
+    parallax is a translation with the rotation that keeps the mean depth in place, scaled so that
+    depth's spread moves 1 px.
     """
     w = 1 / depth.astype(np.float64)
     mean, spread = float(w.mean()), max(float(w.std()), 0.02 * float(w.mean()))
@@ -168,8 +177,7 @@ def motion_axes(depth: FloatImage, camera: CameraIntrinsics) -> Vector:
 @njit(cache=True, nogil=True, fastmath=True)
 def _score(q, match, energy, weight, flow_of_q):  # type: ignore[no-untyped-def]
     """S of one motion: bilinear look-up of C and D at each patch's flow."""
-    rows, cols = energy.shape
-    reach = rows - 1
+    reach = energy.shape[0] - 1
     c, d = 0.0, EVEN
     for b in range(len(weight)):
         u, v = 0.0, 0.0

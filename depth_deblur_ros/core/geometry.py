@@ -2,9 +2,9 @@
 How a motion of the camera moves the pixels.
 
 Notation: x, y pixel; (X, Y, Z) the point it sees; xn = (x - cx) / fx, yn = (y - cy) / fy; p (6,) =
-(theta, v) the motion over the exposure (docs/architecture.md); w = 1 / Z inverse depth [1/m].
-The flow is affine in w: F(x, y) = a(x, y) + w(x, y) b(x, y).
-[LHP80] Longuet-Higgins & Prazdny, Proc. R. Soc. B 208, 1980: the first-order flow, (3) of docs/method.md.
+(theta, v) the motion over the exposure (docs/architecture.md); w = 1 / Z inverse depth [1/m]. The
+flow is affine in w: F(x, y) = a(x, y) + w(x, y) b(x, y). [LHP80] Longuet-Higgins & Prazdny, Proc.
+R. Soc. B 208, 1980: the first-order flow, (3) of docs/method.md.
 """
 
 from __future__ import annotations
@@ -38,11 +38,15 @@ def interaction_matrix(x: Array, y: Array, depth: Array, camera: CameraIntrinsic
         [-(1 + yn * yn), xn * yn, xn, zero, w, -yn * w],
     ]
     focal = (camera.fx, camera.fy)
-    return np.stack([np.stack([f * c for c in row], -1) for f, row in zip(focal, rows, strict=True)], -2)
+    return np.stack(
+        [np.stack([f * c for c in row], -1) for f, row in zip(focal, rows, strict=True)], -2
+    )
 
 
-def flow(p: npt.ArrayLike, depth: npt.NDArray[np.floating], camera: CameraIntrinsics) -> FloatImage:
-    """Give the first-order flow (H, W, 2) [px] of motion p (6,) over the exposure; depth (H, W) [m]."""
+def flow(
+    p: npt.ArrayLike, depth: npt.NDArray[np.floating], camera: CameraIntrinsics
+) -> FloatImage:
+    """Give the first-order flow (H, W, 2) [px] of motion p (6,); depth (H, W) [m]."""
     tx, ty, tz, vx, vy, vz = (float(value) for value in np.asarray(p, np.float64))
     xn, yn = normalised_grid(camera)
     w = 1 / depth
@@ -58,7 +62,7 @@ def rotation_matrix(theta: npt.ArrayLike) -> Array:
     x, y, z = vector
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     if angle < 1e-8:
-        return np.eye(3) + k
+        return np.asarray(np.eye(3) + k)
     return np.asarray(
         np.eye(3) + math.sin(angle) / angle * k + (1 - math.cos(angle)) / angle**2 * k @ k
     )
@@ -67,7 +71,7 @@ def rotation_matrix(theta: npt.ArrayLike) -> Array:
 def warp(
     p: npt.ArrayLike, t: float, depth: npt.NDArray[np.floating], camera: CameraIntrinsics
 ) -> Array:
-    """Give where (H, W, 2) [px] each pixel of mid-exposure stands at time t in [-1/2, 1/2], exactly."""
+    """Give where (H, W, 2) [px] each pixel stands at time t in [-1/2, 1/2], exactly."""
     vector = np.asarray(p, np.float64)
     xn, yn = normalised_grid(camera)
     z = np.asarray(depth, np.float64)
@@ -82,7 +86,9 @@ def warp(
     )
 
 
-def blur_length(p: npt.ArrayLike, depth: npt.NDArray[np.floating], camera: CameraIntrinsics) -> float:
+def blur_length(
+    p: npt.ArrayLike, depth: npt.NDArray[np.floating], camera: CameraIntrinsics
+) -> float:
     """Give the mean length [px] of the flow over the exposure."""
     f = flow(p, depth, camera)
     return float(np.hypot(f[..., 0], f[..., 1]).mean())

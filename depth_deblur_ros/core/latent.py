@@ -1,15 +1,15 @@
 """
 The sharp image when the motion is known.
 
-Notation: L latent light, B blurred light, A the blur (blur.py), u = stored values of L, l' slope of the
-transfer (light.py), sigma noise of the stored values, d(u) differences to the eight neighbours.
-Minimises, (7) of docs/method.md,
+Notation: L latent light, B blurred light, A the blur (blur.py), u = stored values of L, l' slope
+of the transfer (light.py), sigma noise of the stored values, d(u) differences to the eight
+neighbours. Minimises, (7) of docs/method.md,
 
     1/2 |A L - B|^2_W + c sigma^2 sum (|d u|^2 + eps^2)^(alpha / 2),   W = 1 / l'(B)^2,
 
-with differences of the three channels taken together, by iteratively reweighted least squares: each step
-solves a quadratic problem by conjugate gradients, preconditioned with l'^2. Noise is even in stored values,
-not in light, so both the data and the prior are weighted by the slope.
+with differences of the three channels taken together, by iteratively reweighted least squares:
+each step solves a quadratic problem by conjugate gradients, preconditioned with l'^2. Noise is
+even in stored values, not in light, so both the data and the prior are weighted by the slope.
 [KF09] Krishnan & Fergus, NIPS 2009: the hyper-Laplacian prior. [IRLS] Levin et al., SIGGRAPH 2007.
 """
 
@@ -42,7 +42,8 @@ def noise_sigma(stored: FloatImage) -> float:
     """
     Estimate the noise [stored units] of a blurred image (H, W, 3), from its flattest tenth.
 
-    Second differences across both axes remove planes; motion blur leaves little else in flat parts.
+    Second differences across both axes remove planes; motion blur leaves little else in flat
+    parts.
     """
     s = stored.reshape(*stored.shape[:2], -1)
     d = s[1:] - s[:-1]
@@ -58,14 +59,14 @@ def noise_sigma(stored: FloatImage) -> float:
 def restore_latent(
     blurred: FloatImage, blur: BlurOperator, transfer: str, sigma: float, steps: LatentSteps
 ) -> FloatImage:
-    """Give the sharp image (H, W, 3), stored values 0..1, of a blurred one under a known blur."""
+    """Give the sharp image (H, W, 3), stored values, of one under a known blur."""
     light = light_from_stored(blurred, transfer)
     noise = 1 / np.square(light_slope(blurred, transfer))
     full = blurred >= SATURATED
     latent = blur.widen(light)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR) ** 2)
     for _ in range(steps.outer):
-        # What saturated says only "at least this much": drop it where the model already gives more.
+        # What is saturated says only "at least this": drop it where the model gives more.
         trust = np.where(full & (blur.apply(latent) >= light), np.float32(0), noise)
         latent = _reweighted_step(latent, light, blur, transfer, trust, weight, steps.inner)
     return stored_from_light(blur.crop(latent), transfer)
@@ -80,7 +81,7 @@ def _reweighted_step(
     weight: np.float32,
     limit: int,
 ) -> FloatImage:
-    """Solve one reweighted quadratic problem by `limit` preconditioned conjugate gradient steps."""
+    """Solve one reweighted quadratic problem by `limit` conjugate gradient steps."""
     stored = stored_from_light(latent, transfer)
     scale = np.square(light_slope(stored, transfer))
     links = np.zeros((*stored.shape[:2], 4), np.float32)
@@ -109,7 +110,7 @@ def _reweighted_step(
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
 def _link_weights(stored, weight, links):  # type: ignore[no-untyped-def]
-    """Weigh the links to the neighbours right, below, below right, below left: [IRLS] with alpha."""
+    """Weigh the links to the neighbours right, below, below right, below left: [IRLS]."""
     height, width = stored.shape[:2]
     for y in prange(height):
         for x in range(width):
@@ -129,7 +130,7 @@ def _link_weights(stored, weight, links):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
 def _apply_links(u, links, scale, out):  # type: ignore[no-untyped-def]
-    """Apply the prior's quadratic form: sum over the links of weight (u(x) - u(neighbour)) / slope^2."""
+    """Apply the prior's quadratic form: sum of weight (u - u(neighbour)) / slope^2."""
     height, width = u.shape[:2]
     for y in prange(height):
         for x in range(width):

@@ -1,8 +1,8 @@
 """
 From stored values to light and back.
 
-Light adds up during the exposure, stored values do not: `transfer` (data.py) says how they were coded.
-Notation: v stored value 0..1, l(v) light 0..1, l'(v) its slope. [sRGB] IEC 61966-2-1.
+Light adds up during the exposure, stored values do not: `transfer` (data.py) says how they were
+coded. Notation: v stored value 0..1, l(v) light 0..1, l'(v) its slope. [sRGB] IEC 61966-2-1.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def stored_from_light(light: FloatImage, transfer: str) -> FloatImage:
 
 
 def light_slope(stored: FloatImage, transfer: str) -> FloatImage:
-    """Give l'(v), no less than SLOPE_FLOOR: noise of stored values times this is noise of light."""
+    """Give l'(v), no less than SLOPE_FLOOR: noise of light is noise of v times this."""
     if transfer == 'linear':
         return np.ones_like(stored)
     base = (stored + np.float32(0.055)) / np.float32(1.055)
     slope = np.float32(2.4 / 1.055) * base ** np.float32(1.4)
-    return np.maximum(slope, np.float32(SLOPE_FLOOR)).astype(np.float32)
+    return np.asarray(np.maximum(slope, np.float32(SLOPE_FLOOR)), np.float32)

@@ -1,4 +1,4 @@
-"""Every tunable once: the CLI's flags, config/deblur.yaml and the README table are made from here."""
+"""Every tunable once: CLI flags, config/deblur.yaml and the README table come from here."""
 
 from __future__ import annotations
 
@@ -42,8 +42,10 @@ def knobs() -> tuple[Field[Any], ...]:
     return fields(SolverParams)
 
 
-def params_from_mapping(values: Mapping[str, Any], base: SolverParams | None = None) -> SolverParams:
-    """Make parameters from names and values, those not named from base; unknown names are refused."""
+def params_from_mapping(
+    values: Mapping[str, Any], base: SolverParams | None = None
+) -> SolverParams:
+    """Make parameters from names and values, the others as in base; refuse unknown names."""
     known = {knob.name for knob in knobs()}
     for name in values:
         if name not in known:
@@ -55,9 +57,11 @@ def params_from_mapping(values: Mapping[str, Any], base: SolverParams | None = N
 def _checked(knob: Field[Any], value: Any) -> Any:
     if 'choices' in knob.metadata:
         if value not in knob.metadata['choices']:
-            raise InputError(f'{knob.name} must be one of {knob.metadata["choices"]}, got {value!r}')
+            raise InputError(
+                f'{knob.name} must be one of {knob.metadata["choices"]}, got {value!r}'
+            )
         return value
-    kind = type(knob.default)
+    kind: Any = type(knob.default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f'{knob.name} must be of type {kind.__name__}, got {value!r}')
     low, high = knob.metadata['low'], knob.metadata['high']

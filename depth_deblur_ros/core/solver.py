@@ -2,9 +2,9 @@
 The page that tells the algorithm: from one blurred RGB-D frame to the sharp image and the motion.
 
 1 fill the depth map's holes, guided by the colours (depth.py)
-2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or find that there
-  is no blur or nothing to trust: then the frame passes unchanged
-3 restore the image under that motion (latent.py), with near things passing before far ones (blur.py)
+2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or
+  find that there is no blur or nothing to trust: then the frame passes unchanged
+3 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.latent import LatentSteps, noise_sigma, restore_latent
 from depth_deblur_ros.core.params import SolverParams
-from depth_deblur_ros.core.start import blind_start
-from numba import config, get_num_threads, set_num_threads
+from depth_deblur_ros.core.start import blind_start, Start
+import numba
 import numpy as np
 
 
@@ -31,52 +31,47 @@ def deblur(
     """
     Find the sharp image and the camera's motion during the exposure of one frame.
 
-    start: a further motion to start from (the previous frame's, say). Pure: the same input gives the same
-    output, but for seconds. One image cannot tell the sign of the motion, so sign_resolved is False unless
-    there is no motion. Raises InputError when all depth is missing.
+    start: a further motion to start from (the previous frame's, say). Pure: the same input gives
+    the same output, but for seconds. One image cannot tell the sign of the motion, so
+    sign_resolved is False unless there is no motion. Raises InputError when all depth is missing.
     """
     params = params or SolverParams()
     began = time.monotonic()
     with _threads(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
-        first = blind_start(_grey(frame.image), depth, frame.camera, start)
-        image = frame.image
-        if first.outcome is Outcome.SOLVED and params.mode != 'motion':
-            image = _restore(frame, depth, first.motion, params)
-    return DeblurResult(
-        image=image,
-        depth=depth,
-        motion=first.motion,
-        outcome=first.outcome,
-        sign_resolved=first.outcome is Outcome.SHARP,
-        quality=first.quality,
-        blur_px=blur_length(first.motion.vector, depth, frame.camera),
-        seconds=time.monotonic() - began,
-    )
+        found = blind_start(_grey(frame.image), depth, frame.camera, start)
+        return _finish(frame, depth, found, params, began)
 
 
 def restore_known(
     frame: RgbdFrame, motion: Motion, params: SolverParams | None = None
 ) -> DeblurResult:
-    """Restore the image under a known motion: the limit of what any estimate of the motion can reach."""
+    """Restore the image under a known motion: the limit of any estimate of the motion."""
     params = params or SolverParams()
     began = time.monotonic()
     with _threads(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
-        image = _restore(frame, depth, motion, params)
+        return _finish(frame, depth, Start(motion, Outcome.SOLVED, 1.0), params, began)
+
+
+def _finish(
+    frame: RgbdFrame, depth: FloatImage, found: Start, params: SolverParams, began: float
+) -> DeblurResult:
+    """Restore the image where there is a motion and the mode asks for it; sum up."""
+    wanted = found.outcome is Outcome.SOLVED and params.mode != 'motion'
     return DeblurResult(
-        image=image,
+        image=_restored(frame, depth, found.motion, params) if wanted else frame.image,
         depth=depth,
-        motion=motion,
-        outcome=Outcome.SOLVED,
-        sign_resolved=True,
-        quality=1.0,
-        blur_px=blur_length(motion.vector, depth, frame.camera),
+        motion=found.motion,
+        outcome=found.outcome,
+        sign_resolved=found.outcome is Outcome.SHARP,
+        quality=found.quality,
+        blur_px=blur_length(found.motion.vector, depth, frame.camera),
         seconds=time.monotonic() - began,
     )
 
 
-def _restore(
+def _restored(
     frame: RgbdFrame, depth: FloatImage, motion: Motion, params: SolverParams
 ) -> FloatImage:
     """Run the image step on a colour or grey frame."""
@@ -96,11 +91,11 @@ def _grey(image: FloatImage) -> FloatImage:
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
     """Run the kernels and OpenCV on this many threads, and give the process back as it was."""
-    kernels, vision = get_num_threads(), cv2.getNumThreads()
-    set_num_threads(min(count, config.NUMBA_NUM_THREADS))
+    kernels, vision = numba.get_num_threads(), cv2.getNumThreads()
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     cv2.setNumThreads(count)
     try:
         yield
     finally:
-        set_num_threads(kernels)
+        numba.set_num_threads(kernels)
         cv2.setNumThreads(vision)

@@ -1,9 +1,10 @@
 """
 The blind start: where the first motion comes from, out of one blurred image.
 
-The score S (evidence.py) is computed at full, half and quarter scale. Each scale proposes motions, from a grid
-over shifts, roll and zoom and from random ones with parallax, refined by a shrinking search; all scales
-together choose, since a false optimum at one scale seldom is one at the next. docs/method.md (11) to (13).
+The score S (evidence.py) is computed at full, half and quarter scale. Each scale proposes motions,
+from a grid over shifts, roll and zoom and from random ones with parallax, refined by a shrinking
+search; all scales together choose, since a false optimum at one scale seldom is one at the next.
+docs/method.md (11) to (13).
 
 Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes); length = mean blur [px].
 """
@@ -28,7 +29,11 @@ from depth_deblur_ros.core.trust import covariance_from_curvature, sharpness
 import numpy as np
 
 SCALES = (1, 2, 4)
-SHARE = {1: 1.0, 2: 0.5, 4: 0.25}  # of a scale in the common score: coarse bands are deep but inexact
+SHARE = {
+    1: 1.0,
+    2: 0.5,
+    4: 0.25,
+}  # of a scale in the common score: coarse bands are deep but inexact
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
 SEEDS = 8  # distinct motions that each scale refines
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
@@ -38,7 +43,10 @@ SHORTEST = 1.5  # px; below, a motion is not told from the lens's own blur
 SHORT = 8.0  # px; up to here only the full scale sees bands at all
 SHORT_TRUST = 0.08  # least -S at full scale of a short blur
 LONG_TRUST = 0.18  # least common -S of a long blur
-CLEARLY_SHARP, RATHER_SHARP = 1.15, 1.065  # trust.sharpness: nothing to search; no motion and no blur
+CLEARLY_SHARP, RATHER_SHARP = (
+    1.15,
+    1.065,
+)  # trust.sharpness: nothing to search; no motion and no blur
 BELIEF = 0.3  # common -S at which a motion is taken for certain
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
@@ -69,21 +77,25 @@ def blind_start(
     guess: Motion | None = None,
 ) -> Start:
     """
-    Find the motion from one grey image (H, W), stored values 0..1, and its filled depth (H, W) [m].
+    Find the motion from one grey image (H, W), stored values, and its filled depth (H, W) [m].
 
-    guess: a further motion to start from. The sign of the answer is arbitrary: p and -p blur alike.
+    guess: a further motion to start from. The sign of the answer is arbitrary: p and -p blur
+    alike.
     """
     axes = motion_axes(depth, camera)
     if sharpness(grey) > CLEARLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
     scales = _scales(grey, depth, camera, axes)
-    q = _search(scales, None if guess is None else np.linalg.solve(axes, guess.vector))
+    guesses = [np.linalg.solve(axes, guess.vector)] if guess else []
+    q = _search(scales, guesses)
     length = blur_length(axes @ q, depth, camera)
     if not _trusted(q, length, scales):
         sharp = sharpness(grey) > RATHER_SHARP
         return _nothing(Outcome.SHARP if sharp else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
-    return Start(Motion.from_vector(axes @ q, _covariance(q, scales, axes)), Outcome.SOLVED, quality)
+    return Start(
+        Motion.from_vector(axes @ q, _covariance(q, scales, axes)), Outcome.SOLVED, quality
+    )
 
 
 def _trusted(q: Vector, length: float, scales: list[Scale]) -> bool:
@@ -96,7 +108,7 @@ def _trusted(q: Vector, length: float, scales: list[Scale]) -> bool:
 
 
 def _nothing(outcome: Outcome, axes: Vector) -> Start:
-    """Give no motion: still to within SHORTEST when sharp, unknown to within the prior when failed."""
+    """Give no motion: still to within SHORTEST when sharp, anything when failed."""
     spread = SHORTEST / 2 if outcome is Outcome.SHARP else PRIOR_PX
     covariance = spread**2 * axes @ axes.T
     quality = 1.0 if outcome is Outcome.SHARP else 0.0
@@ -106,7 +118,9 @@ def _nothing(outcome: Outcome, axes: Vector) -> Start:
 def _covariance(q: Vector, scales: list[Scale], axes: Vector) -> Vector:
     """Give the covariance (6, 6) of p from how S^2 / 2 bends around q."""
     steps = BEND * np.eye(6)
-    tries = [q + a * steps[i] + b * steps[j] for i in range(6) for j in range(6) for a, b in _SIGNS]
+    tries = [
+        q + a * steps[i] + b * steps[j] for i in range(6) for j in range(6) for a, b in _SIGNS
+    ]
     value = np.square(np.minimum(common_score(np.array(tries), scales), 0)) / 2
     bend = -(value.reshape(6, 6, 4) @ np.array([1, -1, -1, 1])) / (4 * BEND**2)
     return np.asarray(axes @ covariance_from_curvature(bend, OBSERVATIONS, PRIOR_PX) @ axes.T)
@@ -120,14 +134,20 @@ def _scales(
 ) -> list[Scale]:
     """Gather the evidence of every scale that still holds a patch each way."""
     whole = _whole(grey)
-    found = []
+    found: list[Scale] = []
     for factor in SCALES:
         width, height = camera.width // factor, camera.height // factor
         if min(width, height) < PATCH and found:
             break
-        small = [cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (grey, whole)]
-        near = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
-        evidence = gather_evidence(small[0], small[1], near, camera.scaled(width, height), axes)
+        images = [
+            np.asarray(cv2.resize(array, (width, height), interpolation=how), np.float32)
+            for array, how in (
+                (grey, cv2.INTER_AREA),
+                (whole, cv2.INTER_AREA),
+                (depth, cv2.INTER_NEAREST),
+            )
+        ]
+        evidence = gather_evidence(*images, camera.scaled(width, height), axes)
         found.append(Scale(factor, evidence))
     return found
 
@@ -146,9 +166,9 @@ def common_score(qs: Vector, scales: list[Scale]) -> Vector:
     return np.asarray(total)
 
 
-def _search(scales: list[Scale], guess: Vector | None) -> Vector:
+def _search(scales: list[Scale], guesses: list[Vector]) -> Vector:
     """Let each scale propose and all choose; q (6,)."""
-    found = [] if guess is None else [guess]
+    found = list(guesses)
     for scale in scales:
         for seed in _seeds(scale):
             found.append(_refine(seed, [scale], 2.0 * scale.factor))
@@ -158,7 +178,7 @@ def _search(scales: list[Scale], guess: Vector | None) -> Vector:
 
 @lru_cache(maxsize=1)
 def _proposals() -> Vector:
-    """Give motions (m, 6) [px] all over what one scale can see: a grid, and random ones with parallax."""
+    """Give motions (m, 6) [px] over what one scale can see: a grid, and random with parallax."""
     steps = np.arange(-REACH + 2, REACH - 1, 2.0)
     grid = np.stack(
         np.meshgrid(steps, steps[steps >= 0], np.linspace(-18, 18, 7), np.linspace(-12, 12, 5)), -1

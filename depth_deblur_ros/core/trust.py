@@ -1,9 +1,10 @@
 """
 Whether to believe a motion, and how much.
 
-One image must first show that it is blurred at all: a sharp picture gives a wild answer, too. Three witnesses:
-the depth of the dark bands at the found motion (evidence.py), its repetition at the next scale, and how fast
-differences fade when the image is blurred a little further. docs/method.md (13), (14).
+One image must first show that it is blurred at all: a sharp picture gives a wild answer, too.
+Three witnesses: the depth of the dark bands at the found motion (evidence.py), its repetition at
+the next scale, and how fast differences fade when the image is blurred a little further.
+docs/method.md (13), (14).
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ FURTHER = 3.0  # px of further blur
 
 def sharpness(grey: FloatImage) -> float:
     """
-    Give how much further blur along the blurriest direction weakens the strongest tenth of the edges.
+    Give how much further blur weakens the strongest tenth of the edges, least of all directions.
 
     1 = not at all: long motion blur along that direction; 1.1 and more: no blur longer than 2 px.
     """
-    smooth = cv2.GaussianBlur(grey, (0, 0), 0.6)
+    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.6), np.float32)
     ratios = []
     for k in range(DIRECTIONS):
         angle = math.pi * k / DIRECTIONS
@@ -60,8 +61,8 @@ def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -
     """
     Give the covariance (6, 6) [px^2] of q where S^2 / 2 bends by -curvature (6, 6).
 
-    gain: how many independent observations S^2 is made of; directions that the image does not show keep the
-    prior's spread.
+    gain: how many independent observations S^2 is made of; directions that the image does not show
+    keep the prior's spread.
     """
     information = gain * (curvature + curvature.T) / 2
     values, vectors = np.linalg.eigh(information)
