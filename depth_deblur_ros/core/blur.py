@@ -144,14 +144,14 @@ def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _source(x, y, i, seen, ax, ay, bx, by, m, high, wide):  # type: ignore[no-untyped-def]
+def _source(x, y, i, seen, ax, ay, bx, by, m, h, w):  # type: ignore[no-untyped-def]
     """Give the latent cell and the bilinear weights that pixel (x, y) reads at instant i."""
     t = _instant(i, seen.shape[2])
-    w = seen[y, x, i]
-    px = x + m - t * (ax + w * bx)
-    py = y + m - t * (ay + w * by)
-    px = min(max(px, np.float32(0)), np.float32(wide - 1.001))
-    py = min(max(py, np.float32(0)), np.float32(high - 1.001))
+    near = seen[y, x, i]
+    px = x + m - t * (ax + near * bx)
+    py = y + m - t * (ay + near * by)
+    px = min(max(px, np.float32(0)), np.float32(w - 1.001))
+    py = min(max(py, np.float32(0)), np.float32(h - 1.001))
     x0, y0 = int(px), int(py)
     u, v = np.float32(px - x0), np.float32(py - y0)
     one = np.float32(1)

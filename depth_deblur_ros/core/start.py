@@ -86,7 +86,7 @@ def blind_start(
     if sharpness(grey) > CLEARLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
     scales = _scales(grey, depth, camera, axes)
-    guesses = [np.linalg.solve(axes, guess.vector)] if guess else []
+    guesses = [np.asarray(np.linalg.solve(axes, guess.vector))] if guess else []
     q = _search(scales, guesses)
     length = blur_length(axes @ q, depth, camera)
     if not _trusted(q, length, scales):
@@ -147,7 +147,8 @@ def _scales(
                 (depth, cv2.INTER_NEAREST),
             )
         ]
-        evidence = gather_evidence(*images, camera.scaled(width, height), axes)
+        small, whole_small, near = images
+        evidence = gather_evidence(small, whole_small, near, camera.scaled(width, height), axes)
         found.append(Scale(factor, evidence))
     return found
 
