@@ -33,6 +33,7 @@ for _bits, _code in (('8', 'u1'), ('16', 'u2')):
     _LAYOUT['bayer_bggr' + _bits] = (_code, 1, cv2.COLOR_BayerBGGR2RGB)
     _LAYOUT['bayer_gbrg' + _bits] = (_code, 1, cv2.COLOR_BayerGBRG2RGB)
     _LAYOUT['bayer_grbg' + _bits] = (_code, 1, cv2.COLOR_BayerGRBG2RGB)
+DISTORTION_MODELS = ('plumb_bob', 'rational_polynomial')
 _DEPTH_LAYOUT = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 _DEPTH_HEADER = struct.Struct(
     '<iff'
@@ -68,14 +69,14 @@ def depth_from_msg(msg: Any) -> FloatImage:
     return _metres(_samples(msg, _DEPTH_LAYOUT[msg.encoding], 1))
 
 
-def camera_from_msg(info: Any, transfer: str = 'srgb') -> CameraIntrinsics:
+def camera_from_msg(info: Any, transfer: str = 'srgb', rectified: bool = True) -> CameraIntrinsics:
     """
-    Read the sensor_msgs/CameraInfo of a rectified image: P counts (all zero: K), D is ignored.
+    Read a sensor_msgs/CameraInfo: P (all zero: K) of a rectified image, else K and D.
 
     The matrices are those of the full sensor; region of interest and binning lead to the image.
     """
     p, k = np.asarray(info.p, float).reshape(3, 4), np.asarray(info.k, float).reshape(3, 3)
-    m = p if p.any() else k
+    m = p if rectified and p.any() else k
     if not m.any():
         raise InputError('camera_info is not calibrated: K and P are all zero')
     roi, bin_x, bin_y = info.roi, max(1, info.binning_x), max(1, info.binning_y)
@@ -87,8 +88,22 @@ def camera_from_msg(info: Any, transfer: str = 'srgb') -> CameraIntrinsics:
         cy=(float(m[1, 2]) - roi.y_offset + 0.5) / bin_y - 0.5,
         width=int(width) // bin_x,
         height=int(height) // bin_y,
+        distortion=None if rectified else _distortion(info),
         transfer=transfer,
     )
+
+
+def _distortion(info: Any) -> tuple[float, ...] | None:
+    """Give the coefficients of a lens model that can be undone; None where all are zero."""
+    values = tuple(float(value) for value in info.d)
+    if not any(values):
+        return None
+    if info.distortion_model not in DISTORTION_MODELS:
+        raise InputError(
+            f'distortion model {info.distortion_model!r} is not one of '
+            f'{", ".join(DISTORTION_MODELS)}: rectify the images first'
+        )
+    return values
 
 
 def header_fields(stamp: int, frame_id: str) -> Fields:
@@ -115,7 +130,7 @@ def camera_info_fields(camera: CameraIntrinsics, header: Fields) -> Fields:
         'header': header,
         'width': camera.width,
         'height': camera.height,
-        'distortion_model': 'plumb_bob',
+        'distortion_model': DISTORTION_MODELS[len(camera.distortion or ()) > 5],
         'd': list(camera.distortion or [0.0] * 5),
         'k': k,
         'r': np.eye(3).ravel().tolist(),

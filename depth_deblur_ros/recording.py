@@ -9,6 +9,7 @@ from typing import Any
 
 from depth_deblur_ros.bag import BagReader, decoded
 from depth_deblur_ros.core.data import InputError
+from depth_deblur_ros.frames import Pair
 from depth_deblur_ros.mcap_file import BagMessage
 from depth_deblur_ros.messages import camera_from_msg, stamp_ns
 from depth_deblur_ros.pairing import StampPairer
@@ -36,17 +37,6 @@ class Topics:
     def names(self) -> set[str]:
         """Give all that are read."""
         return {name for name in (self.colour, self.depth, self.info, self.exposure) if name}
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """A colour message, its depth message, and what was known when it came; log time [ns]."""
-
-    colour: Any
-    depth: Any
-    info: Any
-    exposure: float | None
-    log_ns: int
 
 
 def choose_topics(bag: BagReader, given: Mapping[str, str], *, with_info: bool) -> Topics:

@@ -10,45 +10,26 @@ import json
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, TextIO
+from typing import TextIO
 
 from depth_deblur_ros.bag import BagReader, BagWriter
 from depth_deblur_ros.core.data import (
     CameraIntrinsics,
     check_exposure,
     DeblurResult,
-    FloatImage,
     InputError,
     Outcome,
     RgbdFrame,
 )
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur
+from depth_deblur_ros.frames import Given, solve_pair, SolvedPair, Solver
 from depth_deblur_ros.mcap_file import BagMessage
-from depth_deblur_ros.messages import (
-    camera_from_msg,
-    depth_from_msg,
-    header_fields,
-    image_from_msg,
-    stamp_ns,
-)
-from depth_deblur_ros.recording import choose_topics, Pair, PairReader, Topics
-from depth_deblur_ros.results import motion_record, refused_result, result_messages, TYPES
-
-Solver = Callable[[RgbdFrame, SolverParams], DeblurResult]
-
+from depth_deblur_ros.messages import stamp_ns
+from depth_deblur_ros.recording import choose_topics, PairReader, Topics
+from depth_deblur_ros.results import motion_record, TYPES
 
 MAX_DURATION_S = 1e9
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedPair:
-    """A pair with its result; reason says why the solver did not take it, frame what it took."""
-
-    pair: Pair
-    frame: RgbdFrame | None
-    result: DeblurResult
-    reason: str = ''
 
 
 @dataclass
@@ -119,7 +100,7 @@ def replay(
             pairs = PairReader(reader, names, round(sync_slop_s * 1e9), copy)
             summary = ReplaySummary(dropped=pairs.dropped)
             for pair in pairs.pairs(*span):
-                solved = solve_pair(pair, camera, exposure_s, params, solve)
+                solved = solve_pair(pair, Given(camera, exposure_s), params, solve)
                 _write(writer, lines, solved)
                 summary.count(solved)
                 if on_frame and solved.frame and not solved.reason:
@@ -129,43 +110,6 @@ def replay(
             summary.damage = reader.damage
             _check_some_solved(summary, pairs, names)
     return summary
-
-
-def solve_pair(
-    pair: Pair,
-    camera: CameraIntrinsics | None,
-    exposure_s: float | None,
-    params: SolverParams,
-    solve: Solver = deblur,
-) -> SolvedPair:
-    """Solve one pair; what cannot be solved is failed, with the reason and its image as it was."""
-    frame = None
-    try:
-        frame = frame_from_pair(pair, camera, exposure_s)
-        return SolvedPair(pair, frame, solve(frame, params))
-    except InputError as error:
-        image, depth = (frame.image, frame.depth) if frame else (_image(pair.colour), None)
-        return SolvedPair(pair, frame, refused_result(image, depth), str(error))
-
-
-def frame_from_pair(
-    pair: Pair, camera: CameraIntrinsics | None = None, exposure_s: float | None = None
-) -> RgbdFrame:
-    """Read a pair; the camera given counts more than camera_info, the exposure given less."""
-    return RgbdFrame(
-        image=image_from_msg(pair.colour),
-        depth=depth_from_msg(pair.depth),
-        camera=camera or camera_from_msg(pair.info),
-        exposure=exposure_s if pair.exposure is None else pair.exposure,
-        stamp_ns=stamp_ns(pair.colour.header),
-    )
-
-
-def _image(msg: Any) -> FloatImage | None:
-    try:
-        return image_from_msg(msg)
-    except InputError:
-        return None
 
 
 def _span(reader: BagReader, start: float, duration: float | None) -> tuple[int, int | None]:
@@ -192,14 +136,12 @@ def _copier(writer: BagWriter) -> Callable[[BagMessage], None]:
 
 
 def _write(writer: BagWriter, lines: TextIO | None, solved: SolvedPair) -> None:
-    pair, frame, result = solved.pair, solved.frame, solved.result
-    stamp, exposure = stamp_ns(pair.colour.header), frame.exposure if frame else None
-    header = header_fields(stamp, pair.colour.header.frame_id)
-    camera = frame.camera if frame else None
-    for topic, fields in result_messages(result, camera, exposure, header, solved.reason):
-        writer.write(f'/{topic}', TYPES[topic], fields, pair.log_ns)
+    for topic, fields in solved.messages():
+        writer.write(f'/{topic}', TYPES[topic], fields, solved.pair.log_ns)
     if lines:
-        lines.write(json.dumps(motion_record(result, stamp, exposure)) + '\n')
+        stamp = stamp_ns(solved.pair.colour.header)
+        exposure = solved.frame.exposure if solved.frame else None
+        lines.write(json.dumps(motion_record(solved.result, stamp, exposure)) + '\n')
 
 
 @contextmanager

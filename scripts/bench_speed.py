@@ -15,8 +15,8 @@ from depth_deblur_ros.bag import BagReader
 from depth_deblur_ros.core.data import FloatImage, RgbdFrame
 from depth_deblur_ros.core.params import MODES, SolverParams
 from depth_deblur_ros.core.solver import deblur
+from depth_deblur_ros.frames import frame_from_pair
 from depth_deblur_ros.recording import choose_topics, PairReader
-from depth_deblur_ros.replay import frame_from_pair
 import numpy as np
 from skimage.restoration import richardson_lucy
 

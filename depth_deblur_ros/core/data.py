@@ -41,9 +41,9 @@ class CameraIntrinsics:
     """
     A pinhole camera of a rectified image.
 
-    fx, fy, cx, cy in pixels; width, height in pixels; distortion plumb_bob [k1 k2 p1 p2 k3] or
-    None (rectified); transfer names the space in which the stored values add up light: 'srgb'
-    (undo the sRGB curve first) or 'linear' (as they are).
+    fx, fy, cx, cy in pixels; width, height in pixels; distortion plumb_bob [k1 k2 p1 p2 k3],
+    rational_polynomial (k4 k5 k6 too) or None (rectified); transfer names the space in which the
+    stored values add up light: 'srgb' (undo the sRGB curve first) or 'linear' (as they are).
     """
 
     fx: float
@@ -204,9 +204,10 @@ def _check_focal(name: str, value: Any, width: int) -> None:
 
 
 def _check_distortion(values: Any) -> None:
-    if len(values) not in (4, 5) or not all(_is_number(k) for k in values):
+    if len(values) not in (4, 5, 8) or not all(_is_number(k) for k in values):
         raise InputError(
-            f'distortion must be 4 or 5 finite numbers k1 k2 p1 p2 [k3], got {values}'
+            'distortion must be 4, 5 or 8 finite numbers k1 k2 p1 p2 [k3 [k4 k5 k6]], '
+            f'got {values}'
         )
 
 

@@ -1,0 +1,141 @@
+"""
+From a pair of messages to what the solver takes, and to what it says: shared by bags and topics.
+
+Images with distortion are undistorted first; the frame's camera is then one without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
+from depth_deblur_ros.core.data import (
+    CameraIntrinsics,
+    DeblurResult,
+    FloatImage,
+    InputError,
+    RgbdFrame,
+)
+from depth_deblur_ros.core.params import SolverParams
+from depth_deblur_ros.messages import (
+    camera_from_msg,
+    depth_from_msg,
+    Fields,
+    header_fields,
+    image_from_msg,
+    stamp_ns,
+)
+from depth_deblur_ros.results import refused_result, result_messages
+import numpy as np
+
+Solver = Callable[[RgbdFrame, SolverParams], DeblurResult]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A colour message, its depth message, and what was known when it came; log time [ns]."""
+
+    colour: Any
+    depth: Any
+    info: Any
+    exposure: float | None
+    log_ns: int
+
+
+@dataclass(frozen=True)
+class Given:
+    """
+    What is known of the images beside their messages.
+
+    camera counts more than camera_info, exposure_s less than an exposure topic; rectified says
+    that camera_info's distortion has been undone; transfer is that of CameraIntrinsics.
+    """
+
+    camera: CameraIntrinsics | None = None
+    exposure_s: float | None = None
+    rectified: bool = True
+    transfer: str = 'srgb'
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPair:
+    """A pair with its result; reason says why the solver did not take it, frame what it took."""
+
+    pair: Pair
+    frame: RgbdFrame | None
+    result: DeblurResult
+    reason: str = ''
+
+    def messages(self) -> list[tuple[str, Fields]]:
+        """Give topic and fields of the messages about this pair, with its colour's header."""
+        source = self.pair.colour.header
+        header = header_fields(stamp_ns(source), source.frame_id)
+        camera = self.frame.camera if self.frame else None
+        exposure = self.frame.exposure if self.frame else None
+        return list(result_messages(self.result, camera, exposure, header, self.reason))
+
+
+def solve_pair(pair: Pair, given: Given, params: SolverParams, solve: Solver) -> SolvedPair:
+    """Solve one pair; what cannot be solved is failed, with the reason and its image as it was."""
+    frame = None
+    try:
+        frame = frame_from_pair(pair, given)
+        return SolvedPair(pair, frame, solve(frame, params))
+    except InputError as error:
+        return unsolved(pair, frame, str(error))
+
+
+def unsolved(pair: Pair, frame: RgbdFrame | None, reason: str) -> SolvedPair:
+    """Give a pair as failed, with its image as it was."""
+    image, depth = (frame.image, frame.depth) if frame else (_image(pair.colour), None)
+    return SolvedPair(pair, frame, refused_result(image, depth), reason)
+
+
+def frame_from_pair(pair: Pair, given: Given | None = None) -> RgbdFrame:
+    """Read a pair of messages."""
+    given = given or Given()
+    if pair.info is None and given.camera is None:
+        raise InputError('no camera_info has come yet')
+    frame = RgbdFrame(
+        image=image_from_msg(pair.colour),
+        depth=depth_from_msg(pair.depth),
+        camera=given.camera or camera_from_msg(pair.info, given.transfer, given.rectified),
+        exposure=given.exposure_s if pair.exposure is None else pair.exposure,
+        stamp_ns=stamp_ns(pair.colour.header),
+    )
+    return undistorted(frame) if frame.camera.distortion else frame
+
+
+def undistorted(frame: RgbdFrame) -> RgbdFrame:
+    """Give the frame as a camera without distortion sees it; depth that is not seen is a hole."""
+    map_x, map_y = _undistortion(frame.camera)
+    border = cv2.BORDER_REPLICATE
+    image = cv2.remap(frame.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
+    # Depths are never mixed: between a near and a far thing there is nothing.
+    depth = cv2.remap(frame.depth, map_x, map_y, cv2.INTER_NEAREST, borderValue=np.nan)
+    return replace(
+        frame,
+        image=np.asarray(image, np.float32).clip(0, 1),
+        depth=np.asarray(depth, np.float32),
+        camera=replace(frame.camera, distortion=None),
+    )
+
+
+@lru_cache(maxsize=2)
+def _undistortion(camera: CameraIntrinsics) -> tuple[FloatImage, FloatImage]:
+    """Give, for each pixel without distortion, where it is in the image as it was taken."""
+    k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    size = (camera.width, camera.height)
+    coefficients = np.array(camera.distortion)
+    maps = cv2.initUndistortRectifyMap(k, coefficients, None, k, size, cv2.CV_32FC1)
+    return np.asarray(maps[0]), np.asarray(maps[1])
+
+
+def _image(msg: Any) -> FloatImage | None:
+    try:
+        return image_from_msg(msg)
+    except InputError:
+        return None
