@@ -1,0 +1,151 @@
+"""
+Slow twins of the compiled kernels, in float64: loops over targets, sparse matrices and scipy.
+
+They are written from the equations in the modules' docstrings, another way round than the
+kernels: what a kernel scatters is gathered here, and an operator is a matrix whose transpose is
+its adjoint.
+"""
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.sparse import coo_matrix
+
+NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (dy, dx) of the four links that a pixel owns
+LEAST_GROWTH = 0.1  # a surface that comes closer than this share of its depth counts as there
+
+
+def instants(samples):
+    """Give the mid-points of equal shares of the exposure, rounded as the kernels round them."""
+    return ((np.arange(samples) + 0.5) / samples - 0.5).astype(np.float32).astype(np.float64)
+
+
+def seen(nearness, ray, motion, flow, samples):
+    """Give the inverse depth (H, W, N) that each pixel sees: the nearest of what covers it."""
+    height, width = nearness.shape
+    y, x = np.indices(nearness.shape)
+    xn, yn = ray[:width][None], ray[width:][:, None]
+    views = []
+    for t in instants(samples):
+        growth = 1 + t * (motion[0] * yn - motion[1] * xn + motion[5] * nearness)
+        near = nearness / np.maximum(growth, LEAST_GROWTH)
+        left, top = np.floor(x + t * flow[..., 0]), np.floor(y + t * flow[..., 1])
+        view = np.zeros((height, width))
+        for row in range(height):
+            for column in range(width):
+                covers = ((left == column) | (left == column - 1)) & (
+                    (top == row) | (top == row - 1)
+                )
+                view[row, column] = near[covers].max(initial=0)
+        views.append(fill_uncovered(view, nearness))
+    return np.stack(views, -1)
+
+
+def fill_uncovered(view, nearness):
+    """Give each zero the lesser of the next values left and right of it; else what was at rest."""
+    filled = view.copy()
+    for row, column in zip(*np.nonzero(view == 0), strict=True):
+        sides = view[row, :column][::-1], view[row, column + 1 :]
+        first = [side[side > 0][0] for side in sides if (side > 0).any()]
+        filled[row, column] = min(first) if first else nearness[row, column]
+    return filled
+
+
+def displacements(blur):
+    """Give (dx, dy), (H, W, N) each: how far [px] from its own place each pixel reads at t_i."""
+    width, samples = blur.inverse_depth.shape[1:]
+    tx, ty, tz, vx, vy, vz, fx, fy = blur.motion.astype(np.float64)
+    ray = blur.ray.astype(np.float64)
+    xn, yn = ray[None, :width, None], ray[width:, None, None]
+    w, t = blur.inverse_depth.astype(np.float64), instants(samples)
+    flow_x = fx * (-xn * yn * tx + (1 + xn**2) * ty - yn * tz + w * (vx - xn * vz))
+    flow_y = fy * (-(1 + yn**2) * tx + xn * yn * ty + xn * tz + w * (vy - yn * vz))
+    return -t * flow_x, -t * flow_y
+
+
+def blur_matrix(blur):
+    """Give A (H W, h w) of a BlurOperator, so that A @ latent is the blurred image."""
+    height, width, samples = blur.inverse_depth.shape
+    high, wide, _ = blur.latent_shape
+    dx, dy = displacements(blur)
+    y, x = np.indices((height, width))
+    px = np.clip(x[..., None] + blur.margin + dx, 0, wide - 1.001)
+    py = np.clip(y[..., None] + blur.margin + dy, 0, high - 1.001)
+    rows = np.broadcast_to((y * width + x)[..., None], px.shape)
+    parts = []
+    for down, right in np.ndindex(2, 2):
+        cell_x, cell_y = np.floor(px) + right, np.floor(py) + down
+        weight = (1 - np.abs(px - cell_x)) * (1 - np.abs(py - cell_y)) / samples
+        parts.append((weight.ravel(), rows.ravel(), (cell_y * wide + cell_x).ravel()))
+    values, i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return coo_matrix((values, (i, j.astype(int))), (height * width, high * wide)).tocsr()
+
+
+def through(matrix, image, shape):
+    """Send each channel of an image through a matrix."""
+    flat = image.reshape(-1, image.shape[-1]).astype(np.float64)
+    return (matrix @ flat).reshape(*shape[:2], image.shape[-1])
+
+
+def links_inside(height, width):
+    """List (y, x, k, y of the neighbour, x of the neighbour) of all links within the image."""
+    found = []
+    for y, x in np.ndindex(height, width):
+        for k, (dy, dx) in enumerate(NEIGHBOURS):
+            if y + dy < height and 0 <= x + dx < width:
+                found.append((y, x, k, y + dy, x + dx))
+    return found
+
+
+def link_weights(stored, weight, epsilon, exponent):
+    """Give the weights (H, W, 4) of one reweighting; those of links that lead outside are zero."""
+    links = np.zeros((*stored.shape[:2], 4))
+    for y, x, k, yy, xx in links_inside(*stored.shape[:2]):
+        m = np.mean((stored[yy, xx].astype(np.float64) - stored[y, x]) ** 2) + epsilon**2
+        links[y, x, k] = weight * (1 if k < 2 else 0.5) * m ** (exponent / 2 - 1)
+    return links
+
+
+def sparse_energy(stored, weight, epsilon, exponent):
+    """Give the hyper-Laplacian energy of which one reweighting takes the gradient."""
+    total = 0.0
+    for y, x, k, yy, xx in links_inside(*stored.shape[:2]):
+        m = np.mean((stored[yy, xx] - stored[y, x]) ** 2) + epsilon**2
+        total += weight * (1 if k < 2 else 0.5) * 3 / exponent * m ** (exponent / 2)
+    return total
+
+
+def prior_energy(u, links, scale):
+    """Give 1/2 sum of weight (u(x) - u(neighbour))^2 / slope^2 over the links and channels."""
+    total = 0.0
+    for y, x, k, yy, xx in links_inside(*u.shape[:2]):
+        steep = np.maximum(scale[y, x], scale[yy, xx])
+        total += 0.5 * links[y, x, k] * np.sum((u[y, x] - u[yy, xx]) ** 2 / steep)
+    return total
+
+
+def prior_matrix(links, scale):
+    """Give the matrix (n, n) of prior_energy, n = H W C: its value is u' P u / 2."""
+    shape = scale.shape
+    matrix = np.zeros((scale.size, scale.size))
+    for y, x, k, yy, xx in links_inside(*shape[:2]):
+        for c in range(shape[2]):
+            d = np.zeros(shape)
+            d[y, x, c], d[yy, xx, c] = 1, -1
+            d = d.ravel()
+            matrix += links[y, x, k] / max(scale[y, x, c], scale[yy, xx, c]) * np.outer(d, d)
+    return matrix
+
+
+def score(q, evidence, even):
+    """Give S of a motion, (9) of docs/method.md, with scipy's look-up of C and D."""
+    reach = evidence.energy.shape[0] - 1
+    c, d = 0.0, even
+    for b, flow in enumerate(evidence.flow_of_q @ q):
+        u, v = -flow if flow[1] < 0 else flow
+        if abs(u) >= reach or v >= reach:
+            d += evidence.weight[b]
+            continue
+        at = [[v], [u + reach]]
+        c += evidence.weight[b] * map_coordinates(np.float64(evidence.match[b]), at, order=1)[0]
+        d += evidence.weight[b] * map_coordinates(np.float64(evidence.energy), at, order=1)[0]
+    return -c / np.sqrt(d)
