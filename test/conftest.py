@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# Small kernels would else spend their time spinning for a core that other programs keep busy.
+os.environ.setdefault('OMP_WAIT_POLICY', 'passive')
+
 from hypothesis import settings
 import pytest
 

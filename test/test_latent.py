@@ -1,0 +1,234 @@
+"""The image step with the motion known: noise, prior, conjugate gradients."""
+
+import cv2
+from depth_deblur_ros.core import latent
+from depth_deblur_ros.core.blur import blur_operator
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion
+from depth_deblur_ros.core.latent import (
+    _apply_links,
+    _link_weights,
+    _reweighted_step,
+    EPSILON,
+    EXPONENT,
+    LatentSteps,
+    noise_sigma,
+    restore_latent,
+)
+from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import oracle
+import pytest
+
+CAMERA = CameraIntrinsics(64.0, 64.0, 31.5, 23.5, 64, 48)
+DEPTH = np.full((48, 64), 2, np.float32)
+STILL = Motion(np.zeros(3), np.zeros(3))
+SIDEWAYS = Motion(np.zeros(3), [9 / 32, 0, 0])  # a blur of 9 px at 2 m
+STEPS = LatentSteps(prior=2.7, outer=3, inner=10)
+WEIGHT = np.float32(2.7 * 0.004**2)
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=25)
+transfers = pytest.mark.parametrize('transfer', ['srgb', 'linear'])
+
+
+def cards(seed, shape=(48, 64)):
+    """Lay coloured cards over each other: edges, and flat parts between them."""
+    rng = np.random.default_rng(seed)
+    image = np.full((*shape, 3), 0.4, np.float32)
+    for _ in range(shape[0] * shape[1] // 60):
+        y, x = rng.integers(-4, shape[0]), rng.integers(-4, shape[1])
+        h, w = rng.integers(3, 12, 2)
+        image[max(y, 0) : y + h, max(x, 0) : x + w] = rng.uniform(0.05, 0.95, 3)
+    return cv2.GaussianBlur(image, (0, 0), 0.5)
+
+
+def links_of(stored):
+    links = np.zeros((*stored.shape[:2], 4), np.float32)
+    _link_weights(stored, WEIGHT, links)
+    return links
+
+
+def smooth(u, links, scale):
+    out = np.empty_like(u)
+    _apply_links(u, links, scale, out)
+    return out
+
+
+def blurred_cards(transfer, sigma=0.0, motion=SIDEWAYS, seed=0):
+    """Give the sharp cards (stored values), what the motion makes of them, and the operator."""
+    blur = blur_operator(motion, DEPTH, CAMERA)
+    wide = cards(seed, blur.latent_shape[:2])
+    taken = stored_from_light(blur.apply(light_from_stored(wide, transfer)), transfer)
+    noise = sigma * np.random.default_rng(seed + 1).standard_normal(taken.shape)
+    return blur.crop(wide), np.clip(taken + noise, 0, 1).astype(np.float32), blur
+
+
+def rms(image):
+    return float(np.sqrt(np.square(image, dtype=np.float64).mean()))
+
+
+@pytest.mark.parametrize('sigma', [0.003, 0.01, 0.03])
+@pytest.mark.parametrize('shape', [(240, 320, 3), (120, 160), (48, 64, 3)])
+def test_the_noise_of_a_plain_picture_is_found(sigma, shape):
+    rng = np.random.default_rng(0)
+    image = (0.5 + sigma * rng.standard_normal(shape)).astype(np.float32)
+    assert noise_sigma(image) == pytest.approx(sigma, rel=0.2)
+
+
+@pytest.mark.parametrize('sigma', [0.003, 0.01, 0.03])
+def test_the_noise_of_a_blurred_picture_is_found(sigma):
+    rng = np.random.default_rng(0)
+    image = cv2.blur(cards(3, (240, 320)), (11, 1)) + sigma * rng.standard_normal((240, 320, 3))
+    assert noise_sigma(image.astype(np.float32)) == pytest.approx(sigma, rel=0.2)
+
+
+def test_a_slope_is_no_noise():
+    y, x = np.indices((60, 80))
+    plane = (0.2 + 0.004 * x + 0.003 * y).astype(np.float32)
+    assert noise_sigma(plane) < 1e-6
+    assert noise_sigma(np.repeat(plane[..., None], 3, 2)) < 1e-6
+
+
+@given(seed=seeds)
+@few
+def test_link_weights_are_their_slow_twin(seed):
+    stored = cards(seed, tuple(np.random.default_rng(seed).integers(1, 9, 2)))
+    slow = oracle.link_weights(stored, WEIGHT, EPSILON, EXPONENT)
+    np.testing.assert_allclose(links_of(stored), slow, rtol=2e-4)
+
+
+@given(seed=seeds)
+@few
+def test_the_prior_is_its_slow_twin_symmetric_and_never_negative(seed):
+    rng = np.random.default_rng(seed)
+    stored = cards(seed, tuple(rng.integers(1, 6, 2)))
+    links, scale = links_of(stored), np.square(light_slope(stored, 'srgb'))
+    units = np.eye(stored.size, dtype=np.float32).reshape(-1, *stored.shape)
+    kernel = np.stack([smooth(unit, links, scale).ravel() for unit in units], 1)
+    np.testing.assert_allclose(kernel, kernel.T, rtol=1e-6)
+    slow = oracle.prior_matrix(links.astype(np.float64), scale.astype(np.float64))
+    np.testing.assert_allclose(kernel, slow, rtol=2e-6, atol=1e-6 * np.abs(slow).max(initial=0))
+    assert np.linalg.eigvalsh(slow).min() >= -1e-9 * np.abs(slow).max()
+    assert (smooth(np.full_like(stored, 0.3), links, scale) == 0).all()
+
+
+@given(seed=seeds)
+@few
+def test_the_prior_is_the_gradient_of_its_energy(seed):
+    rng = np.random.default_rng(seed)
+    stored = cards(seed, (4, 5))
+    links = links_of(stored).astype(np.float64)
+    scale = np.square(light_slope(stored, 'srgb')).astype(np.float64)
+    u, d, step = rng.random(stored.shape), rng.standard_normal(stored.shape), 1e-4
+    up, down = (oracle.prior_energy(u + s * step * d, links, scale) for s in (1, -1))
+    slope = np.vdot(smooth(u, links, scale), d)
+    assert slope == pytest.approx((up - down) / (2 * step), rel=1e-6)
+
+
+@given(seed=seeds)
+@few
+def test_reweighting_takes_the_gradient_of_the_sparse_energy(seed):
+    """At the image that gave the links, quadratic and hyper-Laplacian rise alike."""
+    rng = np.random.default_rng(seed)
+    stored = rng.random((4, 5, 3))
+    links = oracle.link_weights(stored, 1.0, EPSILON, EXPONENT)
+    d, step = rng.standard_normal(stored.shape), 1e-5
+    up, down = (
+        oracle.sparse_energy(stored + s * step * d, 1.0, EPSILON, EXPONENT) for s in (1, -1)
+    )
+    slope = np.vdot(smooth(stored, links, np.ones_like(stored)), d)
+    assert slope == pytest.approx((up - down) / (2 * step), rel=1e-5)
+
+
+@pytest.fixture(scope='module')
+def quadratic():
+    """Give one reweighted problem: its parts, and its value and exact minimum in float64."""
+    _, blurred, blur = blurred_cards('srgb', sigma=0.01)
+    light = light_from_stored(blurred, 'srgb')
+    trust = 1 / np.square(light_slope(blurred, 'srgb'))
+    first = blur.widen(light)
+    stored = stored_from_light(first, 'srgb')
+    links, scale = links_of(stored), np.square(light_slope(stored, 'srgb'))
+    matrix = oracle.blur_matrix(blur)
+
+    def value(x):
+        miss = oracle.through(matrix, x, light.shape) - light
+        rise = smooth(x.astype(np.float64), links.astype(np.float64), scale.astype(np.float64))
+        return 0.5 * np.sum(trust * miss**2) + 0.5 * np.vdot(x.astype(np.float64), rise)
+
+    def after(limit):
+        return _reweighted_step(first, light, blur, 'srgb', trust, WEIGHT, limit)
+
+    return first, value, after
+
+
+def test_no_step_of_the_conjugate_gradients_raises_the_quadratic(quadratic):
+    first, value, after = quadratic
+    np.testing.assert_array_equal(after(0), first)
+    values = [value(after(limit)) for limit in range(16)]
+    assert (np.diff(values) <= 1e-6 * values[0]).all()
+    assert values[10] < 0.2 * values[0]
+
+
+def test_many_steps_reach_the_minimum_of_the_quadratic(quadratic):
+    """There the slope of the quadratic along any direction is nothing beside what it was."""
+    first, value, after = quadratic
+    best, rng = after(150), np.random.default_rng(0)
+    step = 1e-3
+    for _ in range(5):
+        d = rng.standard_normal(first.shape)
+        slopes = [(value(x + step * d) - value(x - step * d)) / (2 * step) for x in (first, best)]
+        assert abs(slopes[1]) < 1e-3 * max(abs(slopes[0]), 1)
+
+
+@transfers
+def test_without_motion_and_noise_little_is_changed(transfer):
+    sharp, taken, blur = blurred_cards(transfer, motion=STILL)
+    restored = restore_latent(taken, blur, transfer, 0.0, STEPS)
+    assert restored.shape == sharp.shape
+    assert restored.dtype == np.float32
+    assert rms(restored - sharp) < 0.01
+
+
+@transfers
+def test_a_plain_picture_stays_plain(transfer):
+    blur = blur_operator(SIDEWAYS, DEPTH, CAMERA)
+    for level in (0.0, 0.02, 0.5, 1.0):
+        plain = np.full((48, 64, 3), level, np.float32)
+        restored = restore_latent(plain, blur, transfer, 0.004, STEPS)
+        np.testing.assert_allclose(restored, level, atol=2e-4)
+
+
+@transfers
+@pytest.mark.parametrize('sigma', [0.0, 0.01])
+def test_the_restored_picture_is_closer_to_the_sharp_one(transfer, sigma):
+    sharp, taken, blur = blurred_cards(transfer, sigma)
+    restored = restore_latent(taken, blur, transfer, sigma, STEPS)
+    assert 0 <= restored.min() <= restored.max() <= 1
+    assert rms(restored - sharp) < 0.5 * rms(taken - sharp)
+
+
+def test_saturated_pixels_do_not_darken_a_lamp(monkeypatch):
+    """A lamp four times as light as white, blurred and clipped, with and without their care."""
+    blur = blur_operator(SIDEWAYS, DEPTH, CAMERA)
+    light = np.full(blur.latent_shape, 0.1, np.float32)
+    middle = np.array(light.shape[:2]) // 2
+    light[middle[0] - 4 : middle[0] + 4, middle[1] - 4 : middle[1] + 4] = 4
+    taken = stored_from_light(blur.apply(light), 'srgb')
+    assert (taken >= latent.SATURATED).any()
+    sharp = stored_from_light(blur.crop(light), 'srgb')
+    careful = restore_latent(taken, blur, 'srgb', 0.002, STEPS)
+    monkeypatch.setattr(latent, 'SATURATED', 2.0)
+    careless = restore_latent(taken, blur, 'srgb', 0.002, STEPS)
+    assert rms(careful - sharp) < 0.8 * rms(careless - sharp)
+    assert rms(careful - sharp) < 0.8 * rms(taken - sharp)
+
+
+def test_more_prior_is_smoother():
+    _, taken, blur = blurred_cards('srgb', sigma=0.02)
+    rough = [
+        rms(np.diff(restore_latent(taken, blur, 'srgb', 0.02, LatentSteps(c, 3, 10)), axis=0))
+        for c in (0.3, 3, 30)
+    ]
+    assert rough[0] > rough[1] > rough[2]
