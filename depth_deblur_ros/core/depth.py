@@ -1,8 +1,8 @@
 """
 Depth without holes, guided by the colour image.
 
-Every hole pixel takes the mean of the measured pixels around it. They are found by asking it and
-eight pixels on a ring around it, as far away as its nearest measurement, for their own nearest
+Every hole pixel takes the mean of measured pixels around it. They are found by asking nine pixels,
+spread around it in proportion to the distance of its nearest measurement, for their own nearest
 measurement: so the reach fits the hole, and all its sides are heard. These seeds count the more,
 the closer they are, the more their colour is that of the hole pixel, and the farther away their
 surface lies: beside an edge, depth cameras lose the background more often than the foreground.
@@ -13,7 +13,7 @@ Notation: d0 distance to the nearest measurement [px], r distance to a seed [px]
 difference, rms over the channels, z depth of a seed and z_max the largest among the seeds [m].
 Weight of a seed, docs/method.md:
 
-    exp(-NEARNESS / 2 r^2 / d0^2 - c^2 / (2 COLOUR_SIGMA^2) - BACKGROUND (1 - z / z_max))
+    (d0 / r)^4 exp(-c^2 / (2 COLOUR_SIGMA^2) - BACKGROUND (1 - z / z_max))
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ import numpy as np
 import numpy.typing as npt
 
 # Measured on cases with known truth; the error is flat around these values (docs/results.md).
-NEARNESS = 4.0
-COLOUR_SIGMA = 0.09  # stored values 0..1
+COLOUR_SIGMA = 0.08  # stored values 0..1
 BACKGROUND = 3.0
 
-# (9, 2) whom to ask, (dy, dx) in units of d0: the pixel itself and the ring.
-_TURN = np.arange(8) * (math.pi / 4)
-RING = np.vstack([np.zeros((1, 2)), np.c_[np.sin(_TURN), np.cos(_TURN)]]).astype(np.float32)
+# (9, 2) whom to ask, (dy, dx) in units of d0: the pixel itself, a near cross, and wide diagonals
+# that hear the far side of the hole too.
+CROSS = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
+ASKED = np.array([*CROSS, (-2, -2), (-2, 2), (2, -2), (2, 2)], np.float32)
+SEEDS = len(ASKED)  # a number, so that the compiler unrolls the loops
 
 
 def fill_depth(depth: FloatImage, guide: FloatImage, *, threads: int) -> FloatImage:
@@ -53,81 +54,84 @@ def fill_depth(depth: FloatImage, guide: FloatImage, *, threads: int) -> FloatIm
     colours = np.ascontiguousarray(guide).reshape(*depth.shape, -1)
     before = get_num_threads()
     set_num_threads(min(threads, config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-    _fill(filled, measured, colours, nearest_measured(measured), RING)
+    _fill(filled, measured, colours, *find_seeds(filled, measured, colours))
     set_num_threads(before)
     return filled
 
 
-def nearest_measured(measured: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint32]:
-    """Give (H, W) the flat index of the measured pixel that is nearest, to about a pixel."""
+def find_seeds(
+    depth: FloatImage, measured: npt.NDArray[np.bool_], colours: FloatImage
+) -> tuple[npt.NDArray[np.uint32], FloatImage]:
+    """
+    Give (H, W) the number of the nearest seed, to about a pixel, and the seeds (n + 1, 3 + C).
+
+    Seeds are the measured pixels that touch a hole, as rows of y, x, depth, colour. Row 0 is none.
+    """
     holes = np.logical_not(measured).view(np.uint8)
+    inside = (cv2.dilate(holes, np.ones((3, 3), np.uint8)) == holes).view(np.uint8)
     _, labels = cv2.distanceTransformWithLabels(
-        holes, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        inside, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    # OpenCV numbers the measured pixels row by row, from 1.
-    nearest: npt.NDArray[np.uint32] = np.flatnonzero(measured).astype(np.uint32)[labels - 1]
-    return nearest
+    rim = np.flatnonzero(inside == 0)
+    seeds = np.zeros((len(rim) + 1, 3 + colours.shape[2]), np.float32)
+    seeds[1:, 0], seeds[1:, 1] = np.divmod(rim, depth.shape[1])  # labelled row by row, from 1
+    seeds[1:, 2] = depth.ravel()[rim]
+    seeds[1:, 3:] = colours.reshape(depth.size, -1)[rim]
+    return labels.view(np.uint32), seeds
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _fill(depth, measured, colours, nearest, ring):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model='numpy', parallel=True)
+def _fill(depth, measured, colours, nearest, seeds):  # type: ignore[no-untyped-def]
     """Write the weighted mean of its seeds into every hole pixel of depth."""
     height, width = measured.shape
     per_colour = np.float32(1 / (2 * COLOUR_SIGMA**2 * colours.shape[2]))
     for y in prange(height):
-        z, cost = np.empty(len(ring), np.float32), np.empty(len(ring), np.float32)
+        z, cost, closeness = np.empty((3, SEEDS), np.float32)
         for x in range(width):
             if measured[y, x]:
                 continue
-            sy, sx = _row_column(nearest[y, x], width)
-            near2 = _square(sy, y) + _square(sx, x)
-            near, per_far2 = math.sqrt(near2), np.float32(NEARNESS / 2) / near2
-            for k in range(len(ring)):
-                v = _step_inside(y, ring[k, 0] * near, height)
-                u = _step_inside(x, ring[k, 1] * near, width)
-                sy, sx = _row_column(nearest[v, u], width)
+            s = nearest[y, x]
+            near2 = _square(seeds[s, 0], y) + _square(seeds[s, 1], x)
+            near = math.sqrt(near2)
+            for k in range(SEEDS):
+                v = _step_inside(y, ASKED[k, 0] * near, height)
+                u = _step_inside(x, ASKED[k, 1] * near, width)
+                s = nearest[v, u]
                 c2 = np.float32(0)
                 for i in range(colours.shape[2]):
-                    c2 += (colours[y, x, i] - colours[sy, sx, i]) ** 2
-                z[k] = depth[sy, sx]
-                cost[k] = per_far2 * (_square(sy, y) + _square(sx, x)) + per_colour * c2
-            depth[y, x] = _mean(z, cost)
+                    c2 += (colours[y, x, i] - seeds[s, 3 + i]) ** 2
+                far2 = _square(seeds[s, 0], y) + _square(seeds[s, 1], x)
+                z[k], cost[k], closeness[k] = seeds[s, 2], per_colour * c2, (near2 / far2) ** 2
+            depth[y, x] = _mean(z, cost, closeness)
 
 
-# Indices are unsigned in what follows, so that none is taken for one counted from the end.
-@njit(cache=True, nogil=True)
-def _row_column(index, width):  # type: ignore[no-untyped-def]
-    """Split a flat index."""
-    row = np.uint32(index) // np.uint32(width)
-    return row, np.uint32(index) - row * np.uint32(width)
+@njit(cache=True, nogil=True, error_model='numpy')
+def _square(a, b):  # type: ignore[no-untyped-def]
+    """Give (a - b)^2."""
+    return (a - np.float32(b)) ** 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _step_inside(start, step, size):  # type: ignore[no-untyped-def]
     """Round start + step to the nearest index in 0..size - 1."""
+    # Cutting off rounds what is positive, the rest is outside. Unsigned: not counted from the end.
     stop = np.int64(np.float32(start) + step + np.float32(0.5))
     return np.uint32(min(max(stop, 0), size - 1))
 
 
-@njit(cache=True, nogil=True)
-def _square(a, b):  # type: ignore[no-untyped-def]
-    """Give (a - b)^2."""
-    return (np.float32(a) - np.float32(b)) ** 2
-
-
-@njit(cache=True, nogil=True)
-def _mean(z, cost):  # type: ignore[no-untyped-def]
-    """Give the mean of z by exp(-cost) and the background's advantage; never beyond z."""
+@njit(cache=True, nogil=True, error_model='numpy')
+def _mean(z, cost, closeness):  # type: ignore[no-untyped-def]
+    """Give the mean of z weighted by closeness, cost and the background's advantage."""
     low = high = z[0]
-    for k in range(1, len(z)):
+    for k in range(1, SEEDS):
         low, high = min(low, z[k]), max(high, z[k])
     advantage = np.float32(BACKGROUND) / high
     total = mean = np.float32(0)
-    for k in range(len(z)):
-        weight = math.exp(advantage * (z[k] - high) - cost[k])
+    for k in range(SEEDS):
+        weight = closeness[k] * math.exp(advantage * (z[k] - high) - cost[k])
         total += weight
         mean += weight * z[k]
-    return min(max(mean / total, low), high)
+    return min(max(mean / total, low), high)  # rounding must not leave the range
 
 
 def _check(depth: FloatImage, guide: FloatImage) -> None:
