@@ -1,5 +1,7 @@
 """How colcon and pip install the package."""
 
+from glob import glob
+
 from setuptools import find_packages, setup
 
 NAME = 'depth_deblur_ros'
@@ -19,7 +21,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', ['config/deblur.yaml']),
+        (f'share/{NAME}/config', ['config/deblur.yaml', 'config/fastdds.xml']),
+        (f'share/{NAME}/config/presets', sorted(glob('config/presets/*.yaml'))),
     ],
     zip_safe=False,
     install_requires=[  # the lowest versions are those of Ubuntu 24.04
@@ -46,6 +49,7 @@ setup(
             'pytest-timeout>=2.2',
             'hypothesis>=6.98',
             'mcap-ros2-support>=0.5',
+            f'cyclonedds>=11{ON_X86_LINUX}',
             'scikit-image>=0.22',
             'colcon-common-extensions>=0.3',
             'colcon-ros>=0.5',
@@ -62,6 +66,7 @@ setup(
         'console_scripts': [
             f'depth-deblur = {NAME}.cli:main',
             f'replay = {NAME}.cli:replay_main',
+            f'deblur_node = {NAME}.node:main',
         ],
     },
 )

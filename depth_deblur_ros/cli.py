@@ -255,7 +255,9 @@ def _solver_params(args: argparse.Namespace) -> SolverParams:
 
 
 def _read_params(path: Path) -> dict[str, Any]:
-    """Read what stands under /**: ros__parameters: of a ROS parameter file."""
+    """Read the solver's part of a ROS parameter file, under /**: ros__parameters:."""
+    from depth_deblur_ros.settings import without_node_values
+
     try:
         content = yaml.load(path.read_text(), _RosYaml)
     except OSError as error:
@@ -264,6 +266,6 @@ def _read_params(path: Path) -> dict[str, Any]:
         line = ' '.join(str(error).split())
         raise InputError(f'{path} is not YAML: {line}') from error
     try:
-        return dict(content['/**']['ros__parameters'])
-    except (KeyError, TypeError, ValueError):
+        return without_node_values(content['/**']['ros__parameters'])
+    except (AttributeError, KeyError, TypeError):
         raise InputError(f'{path} must hold /**: ros__parameters: NAME: VALUE') from None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+import traceback
 from typing import Any
 
 import cv2
@@ -62,12 +63,17 @@ class Given:
 
 @dataclass(frozen=True, eq=False)
 class SolvedPair:
-    """A pair with its result; reason says why the solver did not take it, frame what it took."""
+    """
+    A pair with its result.
+
+    reason says why the solver did not take it, trace where it broke down, frame what it took.
+    """
 
     pair: Pair
     frame: RgbdFrame | None
     result: DeblurResult
     reason: str = ''
+    trace: str = ''
 
     def messages(self) -> list[tuple[str, Fields]]:
         """Give topic and fields of the messages about this pair, with its colour's header."""
@@ -85,13 +91,18 @@ def solve_pair(pair: Pair, given: Given, params: SolverParams, solve: Solver) ->
         frame = frame_from_pair(pair, given)
         return SolvedPair(pair, frame, solve(frame, params))
     except InputError as error:
-        return unsolved(pair, frame, str(error))
+        image, depth = (frame.image, frame.depth) if frame else (_image(pair.colour), None)
+        return SolvedPair(pair, frame, refused_result(image, depth), str(error))
 
 
-def unsolved(pair: Pair, frame: RgbdFrame | None, reason: str) -> SolvedPair:
-    """Give a pair as failed, with its image as it was."""
-    image, depth = (frame.image, frame.depth) if frame else (_image(pair.colour), None)
-    return SolvedPair(pair, frame, refused_result(image, depth), reason)
+def solve_anyhow(pair: Pair, given: Given, params: SolverParams, solve: Solver) -> SolvedPair:
+    """Solve one pair as solve_pair does; a solver that breaks down has failed, too."""
+    try:
+        return solve_pair(pair, given, params, solve)
+    except Exception as error:
+        reason = f'the solver broke down: {type(error).__name__}: {error}'
+        result = refused_result(_image(pair.colour), None)
+        return SolvedPair(pair, None, result, reason, traceback.format_exc())
 
 
 def frame_from_pair(pair: Pair, given: Given | None = None) -> RgbdFrame:

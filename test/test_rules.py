@@ -10,6 +10,7 @@ import sys
 import xml.etree.ElementTree as ET
 
 from depth_deblur_ros.core.params import SolverParams
+from depth_deblur_ros.settings import NodeParams
 import pytest
 import yaml
 
@@ -50,7 +51,7 @@ def functions(path):
 
 
 def test_only_the_node_knows_ros():
-    assert importers(ROS) <= {'node.py'}
+    assert importers(ROS) == {'node.py'}
 
 
 def test_only_bag_knows_the_bag_libraries():
@@ -110,7 +111,8 @@ def test_nobody_takes_more_than_five_positional_arguments(path):
 
 def test_the_config_file_holds_the_defaults():
     text = (ROOT / 'config/deblur.yaml').read_text()
-    assert yaml.safe_load(text) == {'/**': {'ros__parameters': asdict(SolverParams())}}
+    defaults = asdict(SolverParams()) | asdict(NodeParams())
+    assert yaml.safe_load(text) == {'/**': {'ros__parameters': defaults}}
 
 
 def test_config_and_readme_are_up_to_date():
@@ -118,6 +120,8 @@ def test_config_and_readme_are_up_to_date():
     readme = (ROOT / 'README.md').read_text()
     assert (ROOT / 'config/deblur.yaml').read_text() == written['yaml_text']()
     assert readme == written['with_table'](readme), 'run scripts/write_defaults.py'
+    presets = {path.stem: path.read_text() for path in (ROOT / 'config/presets').iterdir()}
+    assert presets == {name: written['preset_text'](name) for name in written['PRESETS']}
 
 
 def test_one_version_everywhere():
