@@ -11,7 +11,7 @@ y_b log-spectrum of patch b and T_u template, both without what scenes have by t
 law and a strength for each direction); C_b(u) = <y_b, T_u> / n; D(u) = |T_u|^2 / n;
 p = G q motion, q (6,) in pixels (motion_axes).
 
-    S(p) = -sum_b w_b C_b(J_b p) / sqrt(sum_b w_b D(J_b p) + 0.2),    the lower the better
+    S(p) = -sum_b w_b C_b(J_b p) / sqrt(sum_b w_b D(J_b p) + 0.1),    the lower the better
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ REACH = (
 )
 SECTORS = 24  # directions in which a scene may be strong or weak by itself
 BAND = (2.5 / PATCH, 0.25)  # cycles/px: above the window's own width, below the lens's blur
-FLOOR = 0.05  # how deep the dark bands are filled by noise and by neighbours in the window
+FLOOR = 0.035  # how deep the dark bands are filled by noise and by neighbours in the window
 CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sensor
-EVEN = 0.2  # of S: keeps faint templates from winning by their small norm
+EVEN = 0.1  # of S: keeps faint templates from winning by their small norm
 MAX_PATCHES = 400
 
 

@@ -35,19 +35,21 @@ SHARE = {
     4: 0.25,
 }  # of a scale in the common score: coarse bands are deep but inexact
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
+FEW = 4  # patches; a coarse scale with less has no vote
 SEEDS = 8  # distinct motions that each scale refines
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
 SATURATED = 0.98
 SHORTEST = 1.5  # px; below, a motion is not told from the lens's own blur
 SHORT = 8.0  # px; up to here only the full scale sees bands at all
-SHORT_TRUST = 0.08  # least -S at full scale of a short blur
-LONG_TRUST = 0.18  # least common -S of a long blur
+SHORT_TRUST = 0.11  # least -S at full scale of a short blur
+LONG_TRUST = 0.2  # least common -S of a long blur
+DOUBT = 1.3  # times that where the picture looks sharp
 CLEARLY_SHARP, RATHER_SHARP = (
     1.15,
     1.065,
 )  # trust.sharpness: nothing to search; no motion and no blur
-BELIEF = 0.3  # common -S at which a motion is taken for certain
+BELIEF = 0.4  # common -S at which a motion is taken for certain
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
 BEND = 1.0  # px, step of the second differences
@@ -83,28 +85,31 @@ def blind_start(
     alike.
     """
     axes = motion_axes(depth, camera)
-    if sharpness(grey) > CLEARLY_SHARP:
+    edges = sharpness(grey)
+    if edges > CLEARLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
     scales = _scales(grey, depth, camera, axes)
+    if not scales:
+        return _nothing(Outcome.FAILED, axes)
     guesses = [np.asarray(np.linalg.solve(axes, guess.vector))] if guess else []
     q = _search(scales, guesses)
     length = blur_length(axes @ q, depth, camera)
-    if not _trusted(q, length, scales):
-        sharp = sharpness(grey) > RATHER_SHARP
-        return _nothing(Outcome.SHARP if sharp else Outcome.FAILED, axes)
+    if not _trusted(q, length, scales, edges):
+        return _nothing(Outcome.SHARP if edges > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     return Start(
         Motion.from_vector(axes @ q, _covariance(q, scales, axes)), Outcome.SOLVED, quality
     )
 
 
-def _trusted(q: Vector, length: float, scales: list[Scale]) -> bool:
+def _trusted(q: Vector, length: float, scales: list[Scale], edges: float) -> bool:
     """Tell whether the bands are deep enough for a blur of this length [px]."""
     if length < SHORTEST:
         return False
     if length < SHORT:
         return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
-    return bool(common_score(q[None], scales)[0] < -LONG_TRUST)
+    needed = LONG_TRUST * (DOUBT if edges > RATHER_SHARP else 1)
+    return bool(common_score(q[None], scales)[0] < -needed)
 
 
 def _nothing(outcome: Outcome, axes: Vector) -> Start:
@@ -132,12 +137,12 @@ _SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 def _scales(
     grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
 ) -> list[Scale]:
-    """Gather the evidence of every scale that still holds a patch each way."""
+    """Gather the evidence of each scale that holds enough patches, of the full one always."""
     whole = _whole(grey)
     found: list[Scale] = []
     for factor in SCALES:
         width, height = camera.width // factor, camera.height // factor
-        if min(width, height) < PATCH and found:
+        if min(width, height) < PATCH:
             break
         images = [
             np.asarray(cv2.resize(array, (width, height), interpolation=how), np.float32)
@@ -149,6 +154,8 @@ def _scales(
         ]
         small, whole_small, near = images
         evidence = gather_evidence(small, whole_small, near, camera.scaled(width, height), axes)
+        if found and len(evidence.weight) < FEW:
+            break
         found.append(Scale(factor, evidence))
     return found
 
@@ -173,8 +180,16 @@ def _search(scales: list[Scale], guesses: list[Vector]) -> Vector:
     for scale in scales:
         for seed in _seeds(scale):
             found.append(_refine(seed, [scale], 2.0 * scale.factor))
-    best = found[int(np.argmin(common_score(np.array(found), scales)))]
-    return _refine(best, scales, 1.0)
+    return _refine(_choose(np.array(found), scales), scales, 1.0)
+
+
+def _choose(qs: Vector, scales: list[Scale]) -> Vector:
+    """Pick the motion that all scales like best; a scale of few patches has less to say."""
+    total = np.zeros(len(qs))
+    for scale in scales:
+        patches = len(scale.evidence.weight)
+        total += patches / (patches + 1) * scores(qs, scale.evidence)
+    return np.asarray(qs[int(np.argmin(total))])
 
 
 @lru_cache(maxsize=1)
