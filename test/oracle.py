@@ -137,7 +137,7 @@ def prior_matrix(links, scale):
 
 
 def score(q, evidence, even):
-    """Give S of a motion, (9) of docs/method.md, with scipy's look-up of C and D."""
+    """Give S of a motion with scipy's look-up of C and D."""
     reach = evidence.energy.shape[0] - 1
     c, d = 0.0, even
     for b, flow in enumerate(evidence.flow_of_q @ q):

@@ -1,0 +1,95 @@
+"""The blind start on straight blurs of a texture: found, not invented, the same each time."""
+
+import cv2
+from depth_deblur_ros.core import start
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
+from depth_deblur_ros.core.evidence import motion_axes
+from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.start import blind_start
+import numpy as np
+from pictures import swept, texture
+import pytest
+
+CAMERA = CameraIntrinsics(262.0, 262.0, 159.5, 119.5, 320, 240)
+DEPTH = np.full((240, 320), 2, np.float32)
+AXES = motion_axes(DEPTH, CAMERA)
+
+
+def sideways(length, angle):
+    """Give the motion that blurs along one straight line [px, rad] all over the picture."""
+    metres_per_px = 2 / 262
+    v = length * metres_per_px * np.array([np.cos(angle), np.sin(angle), 0])
+    return Motion(np.zeros(3), v)
+
+
+def flow_error(result, true):
+    """Give the mean distance [px] of two flows but for the sign."""
+    found = flow(result.motion.vector, DEPTH, CAMERA)
+    known = flow(true.vector, DEPTH, CAMERA)
+    return min(float(np.linalg.norm(found - s * known, axis=-1).mean()) for s in (1, -1))
+
+
+def in_px(covariance):
+    """Give the covariance of q, where p = G q."""
+    return np.linalg.solve(AXES, np.linalg.solve(AXES, covariance).T)
+
+
+@pytest.mark.parametrize('length', [5, 8, 12, 20, 30])
+@pytest.mark.parametrize('angle', [0.0, 0.7, 2.3])
+def test_a_straight_blur_is_found_whatever_its_direction(length, angle):
+    result = blind_start(swept(texture(1), length, angle, 0.005), DEPTH, CAMERA)
+    assert result.outcome is Outcome.SOLVED
+    assert flow_error(result, sideways(length, angle)) < 1
+    assert 0.5 < result.quality <= 1
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_sharp_picture_is_sharp(seed):
+    result = blind_start(texture(seed), DEPTH, CAMERA)
+    assert result.outcome is Outcome.SHARP
+    assert not result.motion.vector.any()
+    assert result.quality == 1
+
+
+def test_a_still_camera_is_still_to_within_the_shortest_blur():
+    still = blind_start(texture(0), DEPTH, CAMERA)
+    expected = (start.SHORTEST / 2) ** 2 * np.eye(6)
+    np.testing.assert_allclose(in_px(still.motion.covariance), expected, atol=1e-6)
+
+
+def test_a_motion_that_is_not_found_may_be_anything():
+    out_of_focus = cv2.GaussianBlur(texture(0), (0, 0), 2.5)
+    failed = blind_start(out_of_focus, DEPTH, CAMERA)
+    assert failed.outcome is Outcome.FAILED
+    assert not failed.motion.vector.any()
+    assert failed.quality == 0
+    expected = start.PRIOR_PX**2 * np.eye(6)
+    np.testing.assert_allclose(in_px(failed.motion.covariance), expected, atol=1e-3)
+
+
+def test_the_start_does_the_same_each_time():
+    grey = swept(texture(1), 12, 0.3)
+    first, second = (blind_start(grey, DEPTH, CAMERA) for _ in range(2))
+    np.testing.assert_array_equal(first.motion.vector, second.motion.vector)
+    np.testing.assert_array_equal(first.motion.covariance, second.motion.covariance)
+
+
+@pytest.mark.parametrize('factor', [1.0, -1.0, 3.0, 0.0, 1e6])
+def test_a_guess_good_or_bad_does_no_harm(factor):
+    guess = Motion.from_vector(factor * sideways(12, 0.3).vector)
+    result = blind_start(swept(texture(1), 12, 0.3), DEPTH, CAMERA, guess)
+    assert result.outcome is Outcome.SOLVED
+    assert flow_error(result, sideways(12, 0.3)) < 1
+
+
+def test_the_covariance_is_symmetric_positive_and_covers_the_error():
+    far = []
+    for k, length in enumerate((5, 7, 10, 14, 18)):
+        true = sideways(length, 0.5 * k)
+        motion = blind_start(swept(texture(k), length, 0.5 * k, 0.005), DEPTH, CAMERA).motion
+        covariance = in_px(motion.covariance)
+        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        misses = [np.linalg.solve(AXES, motion.vector - s * true.vector) for s in (1, -1)]
+        far.append(min(m @ np.linalg.solve(covariance, m) for m in misses))
+    assert np.median(far) < 12.6  # nineteen in twenty of chi squared, 6 degrees of freedom

@@ -1,0 +1,59 @@
+"""Whether there is blur at all, and how much a motion is worth."""
+
+import cv2
+from depth_deblur_ros.core.trust import covariance_from_curvature, sharpness
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+from pictures import swept, texture
+import pytest
+
+PRIOR = 40.0
+
+
+def test_sharpness_falls_with_the_blur():
+    grey = texture(0)
+    found = [sharpness(grey), *(sharpness(swept(grey, length)) for length in (3, 6, 12, 24))]
+    assert (np.diff(found) < 0).all()
+    assert found[0] > 1.15
+    assert found[-1] == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize('angle', np.linspace(0, np.pi, 6, endpoint=False))
+def test_blur_along_any_direction_is_seen(angle):
+    assert sharpness(swept(texture(2), 10, angle)) < 1.06
+
+
+def test_noise_is_sharp():
+    assert sharpness(np.random.default_rng(0).random((120, 160), np.float32)) > 1.5
+
+
+def test_sharpness_is_blind_to_brightness_and_contrast():
+    grey = texture(3)
+    assert sharpness(np.float32(0.2) + np.float32(0.1) * grey) == pytest.approx(
+        sharpness(grey), rel=1e-3
+    )
+
+
+def test_a_plain_picture_gives_a_number():
+    assert np.isfinite(sharpness(np.full((100, 100), 0.5, np.float32)))
+
+
+def test_a_picture_out_of_focus_is_not_sharp():
+    assert sharpness(cv2.GaussianBlur(texture(0), (0, 0), 4)) < 1.1
+
+
+@given(seed=st.integers(0, 2**32 - 1), size=st.floats(-6, 3))
+def test_any_curvature_gives_a_covariance(seed, size):
+    """Symmetric, positive, and never wider than the prior, however the score bends."""
+    bend = 10**size * np.random.default_rng(seed).standard_normal((6, 6))
+    covariance = covariance_from_curvature(bend, 400.0, PRIOR)
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-12)
+    values = np.linalg.eigvalsh(covariance)
+    assert values[0] > 0
+    assert values[-1] <= PRIOR**2 * (1 + 1e-9)
+
+
+def test_a_sharp_optimum_is_worth_its_curvature():
+    covariance = covariance_from_curvature(np.diag([4.0, 1, 1, 1, 1, 0]), 100.0, PRIOR)
+    np.testing.assert_allclose(np.diag(covariance)[[0, 1, 5]], [1 / 400, 1 / 100, 1600], rtol=1e-4)
