@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import Field
 from functools import partial
+import re
 import signal
 import threading
+import time
 from typing import Any
 
 from depth_deblur_ros.core.data import InputError
@@ -73,6 +75,7 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
         self._active = False
         self._pipeline: Pipeline | None = None  # while configured
         self._inputs: list[Any] = []
+        self._said: dict[str, float] = {}  # warnings and when
         self._outputs: dict[str, Any] = {}
         self._settings = self._accepted = self._declare()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -247,9 +250,11 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
         return float(now_ns - stamp_ns(solved.pair.colour.header)) / 1e9
 
     def warn(self, text: str) -> None:
-        """Tell the user, but not with every frame."""
-        if self.context.ok():
-            self.get_logger().warning(text, throttle_duration_sec=SILENCE_S)
+        """Tell the user, but the same only now and then."""
+        kind, now = re.sub(r'\d+', '', text), time.monotonic()
+        if self.context.ok() and now - self._said.get(kind, -SILENCE_S) >= SILENCE_S:
+            self._said = {k: t for k, t in self._said.items() if now - t < SILENCE_S} | {kind: now}
+            self.get_logger().warning(text)
 
     def _send(self, topic: str, fields: Fields) -> None:
         output = self._outputs[topic]

@@ -39,7 +39,7 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
         },
     ),
     'azure_kinect': (
-        'Azure Kinect with azure_kinect_ros_driver, depth and colour enabled. The colour image is\n'
+        'Azure Kinect with azure_kinect_ros_driver, depth and colour on. The colour image is\n'
         '# taken by a rolling shutter: keep the exposure fixed, and state it here.',
         {
             'colour_topic': '/rgb/image_raw',

@@ -1,5 +1,6 @@
 """Settings that every test shares."""
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -12,6 +13,13 @@ import pytest
 settings.register_profile('ci', derandomize=True, deadline=None)
 settings.register_profile('here', deadline=None)  # the first call compiles
 settings.load_profile('ci' if os.environ.get('CI') else 'here')
+
+WITHOUT_ROS = importlib.util.find_spec('rclpy') is None
+collect_ignore_glob = ['test_node*.py'] if WITHOUT_ROS else []
+
+
+def pytest_report_header():
+    return 'rclpy is not installed: the live node is not tested' if WITHOUT_ROS else None
 
 
 @pytest.fixture(autouse=True, scope='session')
