@@ -19,7 +19,7 @@ _ROLES = {  # role: (message types, usual topics)
     'colour': (_IMAGES, ('/rgb/image_rect_color', '/camera/rgb/image_color')),
     'depth': (_IMAGES, ('/depth_registered/image_rect', '/camera/depth/image')),
     'info': (('sensor_msgs/msg/CameraInfo',), ('/rgb/camera_info', '/camera/rgb/camera_info')),
-    'exposure': (('std_msgs/msg/Float32',), ('/exposure',)),
+    'exposure': (('std_msgs/msg/Float32',), ('/exposure', '/camera/rgb/exposure')),
 }
 _TRANSPORTS = ('', '/compressed', '/compressedDepth')
 _DEPTH_ENCODINGS = ('16UC1', '32FC1')

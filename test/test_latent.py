@@ -6,8 +6,9 @@ from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.latent import (
     _apply_links,
+    _conjugate_gradients,
     _link_weights,
-    _reweighted_step,
+    _reweighted,
     EPSILON,
     EXPONENT,
     LatentSteps,
@@ -150,6 +151,7 @@ def quadratic():
     first = blur.widen(light)
     stored = stored_from_light(first, 'srgb')
     links, scale = links_of(stored), np.square(light_slope(stored, 'srgb'))
+    problem = _reweighted(stored, blur, 'srgb', trust, WEIGHT)
     matrix = oracle.blur_matrix(blur)
 
     def value(x):
@@ -158,7 +160,7 @@ def quadratic():
         return 0.5 * np.sum(trust * miss**2) + 0.5 * np.vdot(x.astype(np.float64), rise)
 
     def after(limit):
-        return _reweighted_step(first, light, blur, 'srgb', trust, WEIGHT, limit)
+        return _conjugate_gradients(problem, first, light - blur.apply(first), limit)
 
     return first, value, after
 

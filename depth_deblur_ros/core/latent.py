@@ -66,43 +66,58 @@ def restore_latent(
     latent = blur.widen(light)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR) ** 2)
     for _ in range(steps.outer):
+        missing = light - blur.apply(latent)
         # What is saturated says only "at least this": drop it where the model gives more.
-        trust = np.where(full & (blur.apply(latent) >= light), np.float32(0), noise)
-        latent = _reweighted_step(latent, light, blur, transfer, trust, weight, steps.inner)
+        trust = np.where(full & (missing <= 0), np.float32(0), noise)
+        problem = _reweighted(stored_from_light(latent, transfer), blur, transfer, trust, weight)
+        latent = _conjugate_gradients(problem, latent, missing, steps.inner)
     return stored_from_light(blur.crop(latent), transfer)
 
 
-def _reweighted_step(
-    latent: FloatImage,
-    light: FloatImage,
-    blur: BlurOperator,
-    transfer: str,
-    trust: FloatImage,
-    weight: np.float32,
-    limit: int,
-) -> FloatImage:
-    """Solve one reweighted quadratic problem by `limit` conjugate gradient steps."""
-    stored = stored_from_light(latent, transfer)
-    scale = np.square(light_slope(stored, transfer))
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """(7) with the weights of one reweighting: 1/2 |A L - B|^2_trust + 1/2 <L, links L>."""
+
+    blur: BlurOperator
+    trust: FloatImage  # (H, W, 3)
+    links: FloatImage  # (h, w, 4) weights to the neighbours right, below, below right, below left
+    scale: FloatImage  # (h, w, 3) l'^2
+
+    def smoothness(self, x: FloatImage) -> FloatImage:
+        """Give the gradient of the prior's part."""
+        out = np.empty_like(x)
+        _apply_links(x, self.links, self.scale, out)
+        return out
+
+    def normal(self, x: FloatImage) -> FloatImage:
+        """Apply the normal equations' matrix."""
+        return self.blur.adjoint(self.trust * self.blur.apply(x)) + self.smoothness(x)
+
+
+def _reweighted(
+    stored: FloatImage, blur: BlurOperator, transfer: str, trust: FloatImage, weight: np.float32
+) -> Quadratic:
+    """Put the weights of (7) at the present image, stored values (h, w, 3)."""
     links = np.zeros((*stored.shape[:2], 4), np.float32)
     _link_weights(stored, weight, links)
+    return Quadratic(blur, trust, links, np.square(light_slope(stored, transfer)))
 
-    def normal(x: FloatImage) -> FloatImage:
-        smooth = np.empty_like(x)
-        _apply_links(x, links, scale, smooth)
-        return blur.adjoint(trust * blur.apply(x)) + smooth
 
-    r = blur.adjoint(trust * light) - normal(latent)
-    z = scale * r
+def _conjugate_gradients(
+    problem: Quadratic, latent: FloatImage, missing: FloatImage, limit: int
+) -> FloatImage:
+    """Solve from latent by `limit` steps, preconditioned with l'^2; missing = B - A latent."""
+    r = problem.blur.adjoint(problem.trust * missing) - problem.smoothness(latent)
+    z = problem.scale * r
     d, rz = z, float(np.vdot(r, z))
     for _ in range(limit):
         if rz <= 0:
             break
-        q = normal(d)
+        q = problem.normal(d)
         step = np.float32(rz / float(np.vdot(d, q)))
         latent = latent + step * d
         r = r - step * q
-        z = scale * r
+        z = problem.scale * r
         rz, last = float(np.vdot(r, z)), rz
         d = z + np.float32(rz / last) * d
     return latent
