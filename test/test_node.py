@@ -536,3 +536,34 @@ def displacement_error(move, truth):
     seen = np.array([move.twist.angular.x, move.twist.angular.y])
     distance = min(np.linalg.norm(seen - truth[:2]), np.linalg.norm(seen + truth[:2]))
     return distance / np.linalg.norm(truth[:2])
+
+
+CYCLONE = """<CycloneDDS><Domain><General>
+<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><Peers><Peer address="127.0.0.1"/></Peers>
+<ParticipantIndex>auto</ParticipantIndex></Discovery></Domain></CycloneDDS>"""
+
+
+@pytest.mark.parametrize(('reliability', 'side'), [('best_effort', 120), ('reliable', 480)])
+def test_a_client_on_another_dds(peer, start, tmp_path, reliability, side):
+    pytest.importorskip('cyclonedds')
+    policies = [
+        word
+        for topic in (COLOUR, DEPTH)
+        for word in ('-p', f'qos_overrides./{topic}.subscription.reliability:={reliability}')
+    ]
+    start('-p', 'exposure_s:=0.02', '-p', 'prior:=0.5', *policies)
+    width = side * 4 // 3
+    client = Process(
+        (sys.executable, ros_parts.ROOT / 'test/dds_client.py', 20, width, side),
+        tmp_path / 'client',
+        CYCLONEDDS_URI=CYCLONE,
+    )
+    peer.until(lambda: client.process.poll() is not None, 90)
+    got = client.json()
+    stamps = [1_700_000_000 + number for number in range(20)]
+    size = 3 * width * side
+    assert got['images'] == [[s, 254 - n, size] for n, s in enumerate(stamps)]
+    assert got['twists'] == [[s, -0.03 / 0.02] for s in stamps]
+    assert_all_accounted(peer.settled(published=20))
