@@ -97,15 +97,28 @@ def quality(reliable):
 
 def messages(number):
     """Give camera_info, colour and depth of one frame."""
-    header = Header(Time(1_700_000_000 + number, number), 'camera')
+    header = Header(Time(1_700_000_000 + number, 0), 'camera')
     k = [WIDTH, 0.0, WIDTH / 2, 0.0, WIDTH, HEIGHT / 2, 0.0, 0.0, 1.0]
     p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
     none = Region(0, 0, 0, 0, False)
     info = CameraInfo(header, HEIGHT, WIDTH, 'plumb_bob', [0.0] * 5, k, k, p, 0, 0, none)
-    grey = bytes([1 + number]) * (3 * WIDTH * HEIGHT)
+    grey = bytes([10 + number]) * (3 * WIDTH * HEIGHT)
     colour = Image(header, HEIGHT, WIDTH, 'rgb8', 0, 3 * WIDTH, grey)
     metres = (2000).to_bytes(2, 'little') * (WIDTH * HEIGHT)
     return info, colour, Image(header, HEIGHT, WIDTH, '16UC1', 0, 2 * WIDTH, metres)
+
+
+def exchange(writers, readers, number, patience):
+    """Send one frame; give what each reader has got when all have got something."""
+    for writer, message in zip(writers, messages(number), strict=True):
+        writer.write(message)
+    got = [[] for _ in readers]
+    end = time.monotonic() + patience
+    while time.monotonic() < end and not all(got):
+        for reader, found in zip(readers, got, strict=True):
+            found += reader.take(10)
+        time.sleep(0.005)
+    return got
 
 
 def main():
@@ -128,15 +141,14 @@ def main():
         assert time.monotonic() < patient, 'the node is not there'
         time.sleep(0.1)
     time.sleep(1)
+    for number in range(-5, 0):  # until both sides have met; what is sent earlier may be lost
+        if all(exchange(writers, (images, twists), number, patience=3)):
+            break
     seen, moved = [], []
     for number in range(frames):
-        for writer, message in zip(writers, messages(number), strict=True):
-            writer.write(message)
-        end = time.monotonic() + 2
-        while time.monotonic() < end and not (len(seen) > number and len(moved) > number):
-            seen += [(m.header.stamp.sec, m.data[0], len(m.data)) for m in images.take(10)]
-            moved += [(m.header.stamp.sec, m.twist.angular.z) for m in twists.take(10)]
-            time.sleep(0.005)
+        pictures, motions = exchange(writers, (images, twists), number, patience=5)
+        seen += [(m.header.stamp.sec, m.data[0], len(m.data)) for m in pictures]
+        moved += [(m.header.stamp.sec, m.twist.angular.z) for m in motions]
     sys.stdout.write(json.dumps({'images': seen, 'twists': moved}) + '\n')
 
 
