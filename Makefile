@@ -22,12 +22,13 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# Quality where DEPTH_DEBLUR_DATA names a folder with eval/ cases, then speed.
+# Quality where DEPTH_DEBLUR_DATA names a folder with eval/ cases, then speed, then what the live node adds.
 bench: $(VENV)/.dev
 	@if [ -n "$$DEPTH_DEBLUR_DATA" ]; then \
 	  $(BIN)/depth-deblur bench "$$DEPTH_DEBLUR_DATA/eval" -o out/bench || [ $$? -eq 1 ]; \
 	else echo 'quality: skipped, DEPTH_DEBLUR_DATA is not set'; fi
 	$(BIN)/python scripts/bench_speed.py
+	$(BIN)/python scripts/bench_node.py
 
 clean:
 	rm -rf $(VENV) out build dist install log *.egg-info

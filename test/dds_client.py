@@ -115,8 +115,7 @@ def exchange(writers, readers, number, patience):
     got = [[] for _ in readers]
     end = time.monotonic() + patience
     while time.monotonic() < end and not all(got):
-        for reader, found in zip(readers, got, strict=True):
-            found += reader.take(10)
+        got = [found + reader.take(10) for found, reader in zip(got, readers, strict=True)]
         time.sleep(0.005)
     return got
 

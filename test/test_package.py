@@ -57,9 +57,34 @@ def test_colcon_puts_replay_where_ros_looks_for_it(clone, colcon):
     assert (prefix / 'share' / NAME / 'config/deblur.yaml').is_file()
     # `ros2 run` does no more than this: find the executable under lib/<package>/ and start it.
     executables = sorted(p.name for p in (prefix / 'lib' / NAME).iterdir())
-    assert {'depth-deblur', 'replay'} <= set(executables)
+    assert {'deblur_node', 'depth-deblur', 'replay'} <= set(executables)
     started = f'. install/setup.bash && exec {prefix}/lib/{NAME}/replay --help'
     assert 'usage: depth-deblur replay' in run('bash', '-c', started, cwd=workspace)
+
+
+@pytest.mark.ros
+def test_the_node_starts_as_ros2_run_starts_it(clone, colcon, tmp_path, monkeypatch):
+    index = pytest.importorskip('ament_index_python')
+    import ros_parts
+
+    workspace = clone.parents[1]
+    run(colcon, 'build', '--packages-select', NAME, cwd=workspace)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(workspace / 'install' / NAME))
+    prefix = Path(index.get_package_prefix(NAME))
+    config = Path(index.get_package_share_directory(NAME)) / 'config'
+    assert (config / 'presets/tum_fr1.yaml').is_file()
+    ros_parts.private_domain(monkeypatch)
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(config / 'fastdds.xml'))
+    arguments = f'--ros-args --params-file {config}/deblur.yaml -p lazy:=false'
+    line = f'. {workspace}/install/setup.bash && exec {prefix}/lib/{NAME}/deblur_node {arguments}'
+    peer, node = ros_parts.Peer(), ros_parts.Process(['bash', '-c', line], tmp_path / 'log')
+    try:
+        peer.until(lambda: peer.status()[0].startswith('nothing on /rgb/image_rect_color'), 60)
+        assert peer.status()[1]['mode'] == 'full'
+        assert node.stop() == 0, node.text()
+    finally:
+        peer.close()
+        node.kill()
 
 
 def test_a_wheel_puts_depth_deblur_on_the_path(clone, tmp_path):

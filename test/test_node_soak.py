@@ -1,0 +1,74 @@
+"""Three minutes at 30 Hz, 640x480, with the real solver: nothing lost, nothing piles up."""
+
+import os
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+import play_bag
+import pytest
+import ros_parts
+from sensor_msgs.msg import Image
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
+
+SECONDS = float(os.environ.get('SOAK_SECONDS', '180'))
+SETTLED_S = 60.0  # until then buffers and pools still grow to their size
+SLOPE_LIMIT = 0.2  # MB/s; one image that is kept in each second would be 0.9
+
+
+def memory_mb(pid):
+    """Give the memory [MB] of a process that is resident and its own."""
+    pages = Path(f'/proc/{pid}/statm').read_text().split()
+    return (int(pages[1]) - int(pages[2])) * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
+    ros_parts.private_domain(monkeypatch)
+    remaps = [w for old, new in play_bag.REMAP.items() for w in ('-r', f'{old}:={new}')]
+    peer = ros_parts.Peer()
+    peer.listen(Image, 'deblurred/image')
+    node = ros_parts.Process(
+        [*ros_parts.NODE, '--ros-args', *remaps, '-p', 'mode:=motion'], tmp_path / 'node'
+    )
+    player = None
+    try:
+        peer.until(lambda: peer.status()[0].startswith('nothing on'), 90)
+        play = ros_parts.ROOT / 'scripts/play_bag.py'
+        player = ros_parts.Process(
+            [sys.executable, play, '--frames', int(30 * SECONDS)], tmp_path / 'player'
+        )
+        seen = []
+        begin = time.monotonic()
+        while player.process.poll() is None:
+            peer.spin(1.0)
+            peer.heard['deblurred/image'].clear()
+            seen.append((time.monotonic() - begin, memory_mb(node.pid)))
+        sent = len(player.json()['stamps'])
+        values = peer.settled(timeout=60)
+        assert node.stop() == 0
+    finally:
+        for process in (node, player):
+            if process:
+                process.kill()
+        peer.close()
+    ros_parts.assert_all_accounted(values)
+    lost = {role: int(values[f'{role} lost in transport']) for role in ('colour', 'depth')}
+    assert int(values['arrived']) == sent - lost['colour']
+    assert int(values['depth arrived']) == sent - lost['depth']
+    assert sum(lost.values()) <= 0.001 * sent  # a busy machine may stop a process for long
+    late = np.array([s for s in seen if s[0] > min(SETTLED_S, SECONDS / 2)])
+    slope = np.polyfit(*late.T, 1)[0]
+    figures = {
+        'sent': sent,
+        'lost in transport': lost,
+        'published': int(values['published']),
+        'memory [MB]': round(float(late[:, 1].mean())),
+        'slope [MB/s]': round(float(slope), 3),
+        'latency p99 [s]': values['latency p99 [s]'],
+    }
+    record_property('soak', figures)
+    sys.stdout.write(f'{figures}\n')
+    assert slope < SLOPE_LIMIT, figures
+    assert int(values['published']) > 0
