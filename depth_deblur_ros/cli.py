@@ -82,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     _import_flags(
         command('import-tum', _import_tum, 'a TUM-format folder into a rosbag2 mcap bag')
     )
+    _sequence_flags(command('sequence', _sequence, 'the sharp frames hidden in one exposure'))
     _replay_flags(command('replay', _replay, 'a bag: every pair solved, results in another bag'))
     return parser
 
@@ -107,6 +108,32 @@ def _image(args: argparse.Namespace) -> int:
     print(
         f'{result.outcome.value}: blur {result.blur_px:.1f} px, quality {result.quality:.2f}, '
         f'{result.seconds:.1f} s; {args.out}/deblurred.png, {args.out}/motion.json'
+    )
+    return SOME_FAILED if result.outcome is Outcome.FAILED else DONE
+
+
+def _sequence_flags(parser: _Parser) -> None:
+    _image_flags(parser)
+    parser.add_argument(
+        '--frames', type=int, default=15, metavar='N', help='frames in the exposure (default: 15)'
+    )
+
+
+def _sequence(args: argparse.Namespace) -> int:
+    from depth_deblur_ros.core.sequence import sharp_sequence
+    from depth_deblur_ros.core.solver import deblur
+    from depth_deblur_ros.folders import read_frame, write_image, write_video
+
+    params = _solver_params(args)
+    frame = read_frame(args.rgb, args.depth, args.camera)
+    result = deblur(frame, params)
+    views = sharp_sequence(result.image, result.depth, result.motion, frame.camera, args.frames)
+    for i, view in enumerate(views):
+        write_image(args.out / f'frame_{i:03d}.png', view)
+    write_video(args.out / 'sequence.mp4', views)
+    print(
+        f'{result.outcome.value}: blur {result.blur_px:.1f} px; {len(views)} frames and '
+        f'sequence.mp4 in {args.out} (forwards or backwards: one image cannot tell)'
     )
     return SOME_FAILED if result.outcome is Outcome.FAILED else DONE
 

@@ -7,7 +7,7 @@ written beside their target under another name first, so that a file is whole or
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 import json
 import math
@@ -144,6 +144,22 @@ def write_image(path: Path, image: npt.NDArray[Any]) -> None:
     if not done:
         raise InputError(f'cannot write {path}: {Path(path).suffix!r} is no known image format')
     _write_bytes(path, data.tobytes())
+
+
+def write_video(path: Path, images: Sequence[npt.NDArray[Any]], rate: float = 15.0) -> None:
+    """Write float images (H, W[, 3]) RGB, 0..1, as an MP4 of `rate` frames/s."""
+    height, width = images[0].shape[:2]
+    part = path.with_name(f'.{os.getpid()}.{path.name}')
+    code = cv2.VideoWriter.fourcc(*'mp4v')
+    video = cv2.VideoWriter(str(part), code, rate, (width, height))
+    if not video.isOpened():
+        raise InputError(f'cannot write {path}: no folder to write in, or OpenCV has no MP4')
+    for image in images:
+        pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+        bgr = cv2.COLOR_GRAY2BGR if pixels.ndim == 2 else cv2.COLOR_RGB2BGR
+        video.write(cv2.cvtColor(pixels, bgr))
+    video.release()
+    os.replace(part, path)
 
 
 def write_json(path: Path, record: Mapping[str, Any]) -> None:

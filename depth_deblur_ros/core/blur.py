@@ -83,15 +83,28 @@ def blur_operator(motion: Motion, depth: FloatImage, camera: CameraIntrinsics) -
     longest = float(np.hypot(f[..., 0], f[..., 1]).max())
     samples = int(np.clip(math.ceil(longest), MIN_SAMPLES, MAX_SAMPLES))
     reach = math.ceil(float(np.abs(f).max()) / 2)
+    seen = seen_inverse_depth(motion, depth, camera, samples)
+    # Two more pixels: one for the interpolation, one for what comes nearer during the exposure.
+    return BlurOperator(*_rays_and_motion(motion, camera), seen, reach + 2)
+
+
+def seen_inverse_depth(
+    motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
+) -> FloatImage:
+    """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
+    nearness = np.maximum(1 / depth, np.float32(MIN_INVERSE_DEPTH)).astype(np.float32)
+    seen = np.empty((*depth.shape, samples), np.float32)
+    f = flow(motion.vector, depth, camera)
+    _see(nearness, *_rays_and_motion(motion, camera), f, seen)
+    return seen
+
+
+def _rays_and_motion(motion: Motion, camera: CameraIntrinsics) -> tuple[FloatImage, FloatImage]:
+    """Pack what the kernels need of the camera and of the motion."""
     cols = (np.arange(camera.width) - camera.cx) / camera.fx
     rows = (np.arange(camera.height) - camera.cy) / camera.fy
     ray = np.concatenate([cols, rows]).astype(np.float32)
-    vector = np.concatenate([motion.vector, [camera.fx, camera.fy]]).astype(np.float32)
-    nearness = np.maximum(1 / depth, np.float32(MIN_INVERSE_DEPTH)).astype(np.float32)
-    seen = np.empty((*depth.shape, samples), np.float32)
-    _see(nearness, ray, vector, f, seen)
-    # Two more pixels: one for the interpolation, one for what comes nearer during the exposure.
-    return BlurOperator(ray, vector, seen, reach + 2)
+    return ray, np.concatenate([motion.vector, [camera.fx, camera.fy]]).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)
