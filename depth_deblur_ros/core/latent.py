@@ -26,7 +26,9 @@ import numpy as np
 SATURATED = 0.99  # stored values above may stand for any amount of light
 EPSILON = 0.01  # stored units; differences below this count as noise
 EXPONENT = 0.8  # alpha of the prior [KF09]
-SIGMA_FLOOR = 0.0025  # stored units: 8 bit rounding and what the blur model leaves out
+# Least sigma [stored units]: 8 bit rounding for averaged values; real cameras hide their noise from
+# the estimate by demosaicing and compression, and lens and shutter leave more unexplained.
+SIGMA_FLOOR = {'linear': 0.0025, 'srgb': 0.012}
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def restore_latent(
     noise = 1 / np.square(light_slope(blurred, transfer))
     full = blurred >= SATURATED
     latent = blur.widen(light)
-    weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR) ** 2)
+    weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for _ in range(steps.outer):
         missing = light - blur.apply(latent)
         # What is saturated says only "at least this": drop it where the model gives more.
