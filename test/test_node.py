@@ -152,8 +152,12 @@ def test_nobody_listens_nobody_works_unless_told_to(peer, start):
     peer.until(lambda: publisher.get_subscription_count() == 0)
     moves = peer.listen(TwistStamped, 'displacement')
     peer.until(lambda: publisher.get_subscription_count() == 1)
-    peer.send_frame(START + 2 * SECOND)
-    peer.until(lambda: moves)
+    for i in range(2, 30):  # the first may come before both sides have met
+        peer.send_frame(START + i * SECOND)
+        peer.spin(0.3)
+        if moves:
+            break
+    assert moves
 
 
 def parameters(peer, node='depth_deblur', **values):
@@ -222,7 +226,7 @@ def test_the_lifecycle_stops_and_frees_the_work(peer, start):
     assert len(moves) == 1
     change_state(peer, Transition.TRANSITION_ACTIVATE)
     peer.until(lambda: peer.node.count_subscribers(COLOUR) == 1)
-    peer.spin(0.5)
+    peer.spin(1.0)
     peer.send_frame(START + 2 * SECOND)
     peer.until(lambda: len(moves) == 2)
     assert_all_accounted(peer.settled(published=2))
