@@ -1,5 +1,6 @@
 """Deblurs RGB-D images: the public names."""
 
+import os
 from typing import Any, TYPE_CHECKING
 
 from depth_deblur_ros.core.data import (
@@ -11,6 +12,10 @@ from depth_deblur_ros.core.data import (
     RgbdFrame,
 )
 from depth_deblur_ros.core.params import SolverParams
+
+# Waiting threads of the kernels should sleep: where other programs share the cores, spinning costs
+# more than ten times the work. Read when numba loads, so it is set before.
+os.environ.setdefault('OMP_WAIT_POLICY', 'passive')
 
 if TYPE_CHECKING:
     from depth_deblur_ros.core.solver import deblur

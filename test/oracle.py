@@ -68,8 +68,9 @@ def blur_matrix(blur):
     high, wide, _ = blur.latent_shape
     dx, dy = displacements(blur)
     y, x = np.indices((height, width))
-    px = np.clip(x[..., None] + blur.margin + dx, 0, wide - 1.001)
-    py = np.clip(y[..., None] + blur.margin + dy, 0, high - 1.001)
+    far = blur.margin - 1
+    px = x[..., None] + blur.margin + np.clip(dx, -far, far)
+    py = y[..., None] + blur.margin + np.clip(dy, -far, far)
     rows = np.broadcast_to((y * width + x)[..., None], px.shape)
     parts = []
     for down, right in np.ndindex(2, 2):

@@ -192,6 +192,20 @@ def test_every_pixel_reads_within_the_latent_image(drawn):
     assert np.abs(oracle.displacements(blur)).max() <= blur.margin - 1
 
 
+@pytest.mark.parametrize('count', [1, 2])
+def test_a_board_that_comes_close_stays_within_the_strips(count):
+    """It is twice as near at one end of the exposure as at mid-exposure."""
+    depth = np.full((48, 64), 3, np.float32)
+    depth[20:40, 10:50] = 0.6
+    blur = blur_operator(Motion(np.zeros(3), [0, 0.25, 0.6]), depth, CAMERA)
+    assert np.abs(oracle.displacements(blur)).max() <= blur.margin - 1
+    rng = np.random.default_rng(0)
+    latent, image = rng.random(blur.latent_shape), rng.random((48, 64, 3))
+    with on_threads(count):
+        left, right = np.vdot(blur.apply(latent), image), np.vdot(latent, blur.adjoint(image))
+    assert left == pytest.approx(right, rel=1e-6)
+
+
 @given(seed=seeds, samples=st.integers(1, 4))
 @few
 def test_what_is_seen_is_its_slow_twin(seed, samples):

@@ -185,6 +185,16 @@ def test_noise_is_never_taken_for_motion(contrast, colours):
     np.testing.assert_array_equal(result.image, noise)
 
 
+@pytest.mark.parametrize('colours', [(), (3,)])
+@pytest.mark.parametrize('level', [0.0, 0.5, 1.0])
+def test_a_plain_picture_passes_unchanged(level, colours):
+    plain = np.full((160, 224, *colours), level, np.float32)
+    result = deblur(RgbdFrame(plain, np.full((160, 224), 2, np.float32), SMALL))
+    assert result.outcome is not Outcome.SOLVED
+    assert not result.motion.vector.any()
+    np.testing.assert_array_equal(result.image, plain)
+
+
 def test_the_same_frame_gives_the_same_result(small_frame, small_result):
     assert small_result.outcome is Outcome.SOLVED
     before = small_frame.image.copy()

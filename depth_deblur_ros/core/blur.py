@@ -82,10 +82,16 @@ def blur_operator(motion: Motion, depth: FloatImage, camera: CameraIntrinsics) -
     f = flow(motion.vector, depth, camera)
     longest = float(np.hypot(f[..., 0], f[..., 1]).max())
     samples = int(np.clip(math.ceil(longest), MIN_SAMPLES, MAX_SAMPLES))
-    reach = math.ceil(float(np.abs(f).max()) / 2)
     seen = seen_inverse_depth(motion, depth, camera, samples)
-    # Two more pixels: one for the interpolation, one for what comes nearer during the exposure.
-    return BlurOperator(*_rays_and_motion(motion, camera), seen, reach + 2)
+    margin = _margin(motion, seen, camera)
+    return BlurOperator(*_rays_and_motion(motion, camera), seen, margin)
+
+
+def _margin(motion: Motion, seen: FloatImage, camera: CameraIntrinsics) -> int:
+    """Give how far [px] pixels read, by the nearest and the farthest that each sees."""
+    ends = (flow(motion.vector, 1 / w, camera) for w in (seen.min(axis=2), seen.max(axis=2)))
+    reach = max(float(np.abs(f).max()) / 2 for f in ends)
+    return math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: the interpolation
 
 
 def seen_inverse_depth(
@@ -167,11 +173,10 @@ def _flow_parts(x, y, ray, width, m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _cell(px, py, high, wide):  # type: ignore[no-untyped-def]
-    """Give the cell of a point, held inside (high, wide), and its four bilinear weights."""
-    zero, one, edge = np.float32(0), np.float32(1), np.float32(1.001)
-    px = min(max(px, zero), np.float32(wide) - edge)
-    py = min(max(py, zero), np.float32(high) - edge)
+def _cell(cx, cy, dx, dy, far):  # type: ignore[no-untyped-def]
+    """Give the cell at most far from (cx, cy), dx and dy before it, and its bilinear weights."""
+    px, py = cx - min(max(dx, -far), far), cy - min(max(dy, -far), far)
+    one = np.float32(1)
     x0, y0 = np.uint32(px), np.uint32(py)
     u, v = px - np.float32(x0), py - np.float32(y0)
     w11 = u * v
@@ -184,7 +189,8 @@ def _cell(px, py, high, wide):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
 def _gather(latent, seen, ray, motion, margin, blurred):  # type: ignore[no-untyped-def]
     height, width, samples = seen.shape
-    high, wide = latent.shape[:2]
+    wide = latent.shape[1]
+    far = np.float32(margin - 1)  # what lies farther is taken from there
     flat = latent.reshape(-1)
     share, half = np.float32(1.0 / samples), np.float32(0.5)
     row, one, two, three = np.uint32(3 * wide), np.uint32(1), np.uint32(2), np.uint32(3)
@@ -196,8 +202,8 @@ def _gather(latent, seen, ray, motion, margin, blurred):  # type: ignore[no-unty
             for i in range(samples):
                 t = np.float32(i + half) * share - half
                 near = seen[y, x, i]
-                px, py = cx - t * (ax + near * bx), cy - t * (ay + near * by)
-                x0, y0, w00, w01, w10, w11 = _cell(px, py, high, wide)
+                dx, dy = t * (ax + near * bx), t * (ay + near * by)
+                x0, y0, w00, w01, w10, w11 = _cell(cx, cy, dx, dy, far)
                 p = np.uint32(y0 * row + three * x0)
                 q, n, m = np.uint32(p + row), np.uint32(p + three), np.uint32(p + row + three)
                 r += w00 * flat[p] + w01 * flat[n] + w10 * flat[q] + w11 * flat[m]
@@ -221,6 +227,7 @@ def _scatter(blurred, seen, ray, motion, margin, parts):  # type: ignore[no-unty
     """Spread each blurred pixel over what it read; strip k of rows writes to parts[k] alone."""
     height, width, samples = seen.shape
     strips, wide = parts.shape[0], parts.shape[2]
+    far = np.float32(margin - 1)  # a strip ends there
     share, half = np.float32(1.0 / samples), np.float32(0.5)
     row, three = np.uint32(3 * wide), np.uint32(3)
     for k in prange(strips):
@@ -235,8 +242,8 @@ def _scatter(blurred, seen, ray, motion, margin, parts):  # type: ignore[no-unty
                 for i in range(samples):
                     t = np.float32(i + half) * share - half
                     near = seen[y, x, i]
-                    px, py = cx - t * (ax + near * bx), cy - t * (ay + near * by)
-                    x0, y0, w00, w01, w10, w11 = _cell(px, py, height + 2 * margin, wide)
+                    dx, dy = t * (ax + near * bx), t * (ay + near * by)
+                    x0, y0, w00, w01, w10, w11 = _cell(cx, cy, dx, dy, far)
                     p = np.uint32((y0 - np.uint32(first)) * row + three * x0)
                     for c in range(3):
                         j = np.uint32(p + np.uint32(c))

@@ -119,7 +119,7 @@ def gather_evidence(
     return Evidence(
         match.reshape(len(corners), *table.energy.shape),
         table.energy,
-        weight**0.25 / (weight**0.25).sum(),
+        weight**0.25 / max(float((weight**0.25).sum()), 1e-12),  # all 0 where all is plain
         _flow_of_q(corners, depth, camera, axes),
     )
 

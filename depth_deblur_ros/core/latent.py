@@ -26,8 +26,8 @@ import numpy as np
 SATURATED = 0.99  # stored values above may stand for any amount of light
 EPSILON = 0.01  # stored units; differences below this count as noise
 EXPONENT = 0.8  # alpha of the prior [KF09]
-# Least sigma [stored units]: 8 bit rounding for averaged values; real cameras hide their noise from
-# the estimate by demosaicing and compression, and lens and shutter leave more unexplained.
+# Least sigma [stored units]: 8 bit rounding for averaged values; real cameras hide their noise
+# from the estimate by demosaicing, and lens and shutter leave more unexplained.
 SIGMA_FLOOR = {'linear': 0.0025, 'srgb': 0.012}
 
 
@@ -42,7 +42,7 @@ class LatentSteps:
 
 def noise_sigma(stored: FloatImage) -> float:
     """
-    Estimate the noise [stored units] of a blurred image (H, W, 3), from its flattest tenth.
+    Estimate the noise [stored units] of a blurred image (H, W, 3), from its flattest fifth.
 
     Second differences across both axes remove planes; motion blur leaves little else in flat
     parts.
@@ -117,7 +117,7 @@ def _conjugate_gradients(
             break
         q = problem.normal(d)
         step = np.float32(rz / float(np.vdot(d, q)))
-        latent = latent + step * d
+        latent = np.asarray(latent + step * d, latent.dtype)
         r = r - step * q
         z = problem.scale * r
         rz, last = float(np.vdot(r, z)), rz
