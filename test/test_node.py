@@ -137,6 +137,16 @@ def test_a_solver_too_slow_drops_whole_pairs_and_counts_them(peer, start):
     assert stamps(moves) == sorted(stamps(moves)) and stamps(moves)[-1] == sent[-1]
 
 
+def send_until(peer, stamp, condition):
+    """Send frames: the first may be lost, before both sides have met."""
+    for i in range(100):
+        peer.send_frame(stamp + i * SECOND)
+        peer.spin(0.2)
+        if condition():
+            return
+    pytest.fail(f'{i} frames were of no use; last: {peer.status()}')
+
+
 def test_nobody_listens_nobody_works_unless_told_to(peer, start):
     start()
     peer.until(lambda: peer.status()[0] == 'idle: nobody subscribes')
@@ -145,19 +155,13 @@ def test_nobody_listens_nobody_works_unless_told_to(peer, start):
     assert publisher.get_subscription_count() == 0
     parameters(peer, lazy=False)
     peer.until(lambda: publisher.get_subscription_count() == 1)
-    for stamp in (START, START + SECOND):
-        peer.send_frame(stamp)
-    peer.settled(published=2)
+    send_until(peer, START, lambda: int(peer.status()[1]['published']) > 1)
     parameters(peer, lazy=True)
     peer.until(lambda: publisher.get_subscription_count() == 0)
     moves = peer.listen(TwistStamped, 'displacement')
     peer.until(lambda: publisher.get_subscription_count() == 1)
-    for i in range(2, 30):  # the first may come before both sides have met
-        peer.send_frame(START + i * SECOND)
-        peer.spin(0.3)
-        if moves:
-            break
-    assert moves
+    send_until(peer, START + 1000 * SECOND, lambda: moves)
+    assert_all_accounted(peer.settled())
 
 
 def parameters(peer, node='depth_deblur', **values):
@@ -456,12 +460,7 @@ def test_a_killed_node_starts_anew(peer, start):
     start()
     # DDS notices the death late; the new node hears the same publishers.
     peer.until(lambda: peer.status()[1].get('arrived') == '0')
-    for i in range(1, 100):
-        peer.send_frame(START + i * SECOND)
-        peer.spin(0.2)
-        if len(moves) > 1:
-            break
-    assert len(moves) > 1
+    send_until(peer, START + SECOND, lambda: len(moves) > 1)
 
 
 @pytest.mark.parametrize(
