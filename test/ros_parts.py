@@ -128,6 +128,7 @@ class Peer:
 
     def settled(self, published=None, arrived=None, timeout=30.0):
         """Wait for a status with these counts in which nothing waits any more; give its values."""
+        self.heard['/diagnostics'].clear()  # an old one may be settled, too
         wanted = {'published': published, 'arrived': arrived, 'waiting': 0}
 
         def holds():
