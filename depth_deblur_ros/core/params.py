@@ -10,6 +10,7 @@ from typing import Any
 from depth_deblur_ros.core.data import InputError
 
 MODES = ('full', 'fast', 'motion')
+METHODS = ('spectra', 'paper')
 
 
 def knob(default: float, low: float, high: float, text: str) -> Any:
@@ -38,6 +39,22 @@ class SolverParams:
     prior: float = knob(2.7, 0.01, 100.0, 'weight of the image prior: more is smoother [c]')
     reweightings: int = knob(3, 1, 20, 'quadratic problems that the image step solves')
     cg_steps: int = knob(10, 1, 100, 'conjugate gradient steps in each of them')
+    method: str = choice(
+        'spectra', METHODS, "paper: the paper's method and the parameters below; slow, a baseline"
+    )
+    mu1: float = knob(-20.0, -50.0, 0.0, 'paper: reward of motion')
+    mu2: float = knob(0.2, 0.0, 1e6, 'paper: smoothness of the flow, less at edges of the image')
+    mu3: float = knob(0.2, 0.0, 1e6, 'paper: smoothness of the flow, less at edges of the depth')
+    mu4: float = knob(0.05, 0.0, 100.0, 'paper: total variation, for values 0..255')
+    sigma_b: float = knob(0.01, 0.0001, 10.0, 'paper: edge of the image, light 0..1 per pixel')
+    sigma_d: float = knob(0.02, 0.0001, 100.0, 'paper: edge of the depth, metres per pixel')
+    eta: float = knob(10.0, 0.0001, 1000.0, 'paper: primal step')
+    gamma: float = knob(0.005, 0.0, 10.0, 'paper: dual step, for values 0..255')
+    levels: int = knob(11, 1, 30, 'paper: pyramid levels')
+    scale_factor: float = knob(0.9, 0.5, 0.95, 'paper: from one level to the next')
+    kernel_size: int = knob(25, 5, 49, 'paper: side of the uniform kernel, pixels')
+    alternations: int = knob(3, 1, 50, 'paper: turns of motion and image at each level')
+    primal_dual_steps: int = knob(20, 1, 1000, 'paper: steps of the last image step')
 
     def __post_init__(self) -> None:
         check_values(self)

@@ -5,6 +5,8 @@ The page that tells the algorithm: from one blurred RGB-D frame to the sharp ima
 2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or
   find that there is no blur or nothing to trust: then the frame passes unchanged
 3 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
+
+With `method` paper, 2 and 3 are the paper's: alternation.py.
 """
 
 from __future__ import annotations
@@ -14,11 +16,13 @@ from contextlib import contextmanager
 import time
 
 import cv2
+from depth_deblur_ros.core.alternation import alternate, restore
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import DeblurResult, FloatImage, Motion, Outcome, RgbdFrame
 from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.latent import LatentSteps, noise_sigma, restore_latent
+from depth_deblur_ros.core.light import light_from_stored, stored_from_light
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
 import numba
@@ -39,7 +43,10 @@ def deblur(
     began = time.monotonic()
     with _threads(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
-        found = blind_start(_grey(frame.image), depth, frame.camera, start)
+        if params.method == 'paper':
+            found = _alternated(frame, depth, params)
+        else:
+            found = blind_start(_grey(frame.image), depth, frame.camera, start)
         return _finish(frame, depth, found, params, began)
 
 
@@ -75,13 +82,28 @@ def _restored(
     frame: RgbdFrame, depth: FloatImage, motion: Motion, params: SolverParams
 ) -> FloatImage:
     """Run the image step on a colour or grey frame."""
-    grey = frame.image.ndim == 2
-    colour = np.repeat(frame.image[..., None], 3, 2) if grey else frame.image
-    blur = blur_operator(motion, depth, frame.camera)
-    outer = 1 if params.mode == 'fast' else params.reweightings
-    steps = LatentSteps(params.prior, outer, params.cg_steps)
-    sharp = restore_latent(colour, blur, frame.camera.transfer, noise_sigma(colour), steps)
-    return np.ascontiguousarray(sharp[..., 0]) if grey else sharp
+    colour, camera = _colour(frame.image), frame.camera
+    if params.method == 'paper':
+        light = light_from_stored(colour, camera.transfer)
+        latent = restore(light, depth, camera, motion.vector, params)
+        sharp = stored_from_light(latent, camera.transfer)
+    else:
+        blur = blur_operator(motion, depth, camera)
+        outer = 1 if params.mode == 'fast' else params.reweightings
+        steps = LatentSteps(params.prior, outer, params.cg_steps)
+        sharp = restore_latent(colour, blur, camera.transfer, noise_sigma(colour), steps)
+    return np.ascontiguousarray(sharp[..., 0]) if frame.image.ndim == 2 else sharp
+
+
+def _alternated(frame: RgbdFrame, depth: FloatImage, params: SolverParams) -> Start:
+    """Find the motion by the paper's method."""
+    light = light_from_stored(_colour(frame.image), frame.camera.transfer)
+    found = alternate(light, depth, frame.camera, params)
+    return Start(Motion.from_vector(found.p), found.outcome, found.quality)
+
+
+def _colour(image: FloatImage) -> FloatImage:
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
 
 
 def _grey(image: FloatImage) -> FloatImage:
