@@ -21,7 +21,10 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', ['config/deblur.yaml', 'config/fastdds.xml']),
+        (
+            f'share/{NAME}/config',
+            ['config/deblur.yaml', 'config/fastdds.xml', 'config/paper.yaml'],
+        ),
         (f'share/{NAME}/config/presets', sorted(glob('config/presets/*.yaml'))),
     ],
     zip_safe=False,

@@ -4,7 +4,7 @@ import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics
 from depth_deblur_ros.core.geometry import flow
-from depth_deblur_ros.core.uniform import motion_of_flow, streak, uniform_kernel
+from depth_deblur_ros.core.uniform import motions_of_flow, streak, uniform_kernel
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -75,7 +75,14 @@ def test_the_kernel_is_the_same_each_time():
 
 def test_the_motion_of_a_flow_gives_that_flow_back():
     u, depth = np.array([6.0, -4.0]), np.full((120, 160), 2.0, np.float32)
-    found = flow(motion_of_flow(u, depth, CAMERA), depth, CAMERA)
+    turn, shift = (flow(p, depth, CAMERA) for p in motions_of_flow(u, depth, CAMERA))
+    np.testing.assert_allclose(shift, np.broadcast_to(u, shift.shape), atol=1e-4)
     # A rotation bends the flow towards the corners, by tan^2 of 22 degrees at most.
-    np.testing.assert_allclose(found.mean((0, 1)), u, rtol=0.02)
-    assert np.hypot(*(found - u).transpose(2, 0, 1)).max() < 0.2 * math.hypot(*u)
+    np.testing.assert_allclose(turn.mean((0, 1)), u, rtol=0.02)
+    assert np.hypot(*(turn - u).transpose(2, 0, 1)).max() < 0.2 * math.hypot(*u)
+
+
+def test_a_turn_and_a_shift_are_proposed():
+    turn, shift = motions_of_flow(np.array([3.0, 1.0]), np.ones((120, 160), np.float32), CAMERA)
+    assert turn[:3].any() and not turn[3:].any()
+    assert shift[3:].any() and not shift[:3].any()

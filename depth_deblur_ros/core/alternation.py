@@ -33,7 +33,7 @@ from depth_deblur_ros.core.motion import Bowl, levenberg_marquardt, MotionProble
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.primal_dual import PrimalDualSteps, restore_by_primal_dual
 from depth_deblur_ros.core.pyramid import build_pyramid, Level
-from depth_deblur_ros.core.uniform import motion_of_flow, streak, uniform_kernel
+from depth_deblur_ros.core.uniform import motions_of_flow, streak, uniform_kernel
 import numpy as np
 
 GREY_LEVELS = 255.0  # the paper's values; ours span 0..1
@@ -43,6 +43,7 @@ STRETCHES = (1.0, 0.75, 1.3, 1.6)  # of the best proposal
 SHORTEST = 4.0  # px; the uniform start takes lens blur for shorter motion
 VISIBLE = 5.0  # px of blur at a level: below, it does not show the motion
 TURN_STEPS = 10  # primal-dual steps of the image step within a turn
+LEGIBLE = 16.0  # px of blur: finer levels cost much and add nothing
 ANSWERING = 8  # conjugate gradient steps by which L answers in the motion step
 LONGEST_STEP = 2.0  # px
 MOST_DAMPING = 10.0
@@ -103,6 +104,8 @@ def alternate(
         problem = LevelProblem.at(level, params)
         if problem.length(p) < VISIBLE and index + 1 < len(levels):
             continue
+        if trace and problem.length(p) > LEGIBLE:
+            break
         p, gain = problem.take_turns(p, index, trace)
         still = still + 1 if gain < SETTLED else 0
         if still == 2:
@@ -136,14 +139,14 @@ def first_motion(levels: tuple[Level, ...], params: SolverParams) -> Vector:
     proposals = []
     for level in [levels[k] for k in KERNEL_LEVELS if k < len(levels)]:
         u = streak(uniform_kernel(level.image.mean(2), params.kernel_size))
-        proposals.append(motion_of_flow(u, level.depth, level.camera))
-    lengths = [blur_length(p, finest.depth, finest.camera) for p in proposals]
+        proposals.append(motions_of_flow(u, level.depth, level.camera))
+    lengths = [blur_length(turn, finest.depth, finest.camera) for turn, _ in proposals]
     needed = VISIBLE / max(float(np.median(lengths)), VISIBLE) * finest.camera.width
     level = next(one for one in levels if one.camera.width >= needed)
     problem = LevelProblem.at(level, params)
-    best = min(proposals, key=problem.merit_of)
+    best = min(proposals, key=lambda one: problem.merit_of(one[0]))
     # Faint ends of a streak are lost in the kernel, and ringing adds to it.
-    return min((s * best for s in STRETCHES), key=problem.merit_of)
+    return min((s * p for p in best for s in STRETCHES), key=problem.merit_of)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,17 +37,20 @@ EXACT, SOLVING = 1e-5, 200  # of the least squares: relative, and conjugate grad
 GROWTH = math.sqrt(2)  # from one kernel size to the next
 
 
-def motion_of_flow(u: Vector, depth: FloatImage, camera: CameraIntrinsics) -> Vector:
+def motions_of_flow(u: Vector, depth: FloatImage, camera: CameraIntrinsics) -> tuple[Vector, ...]:
     """
-    Give the rotation p (6,) whose flow is nearest, in least squares, to u (2,) [px] everywhere.
+    Give the rotation and the translation, p (6,) each, that come nearest to a flow u (2,) [px].
 
-    A translation could do the same: the kernel does not tell them apart.
+    In least squares over all pixels, (22): one kernel does not tell the two apart.
     """
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.float64)
-    j = interaction_matrix(x, y, depth.astype(np.float64), camera)[..., :3]
+    j = interaction_matrix(x, y, depth.astype(np.float64), camera)
     normal = np.einsum('yxai,yxaj->ij', j, j, optimize=True)
-    theta = np.linalg.solve(normal, np.einsum('yxai,a->i', j, u))
-    return np.concatenate([theta, np.zeros(3)])
+    right = np.einsum('yxai,a->i', j, u)
+    turn, shift = np.zeros(6), np.zeros(6)
+    turn[:3] = np.linalg.solve(normal[:3, :3], right[:3])
+    shift[3:] = np.linalg.solve(normal[3:, 3:], right[3:])
+    return turn, shift
 
 
 def uniform_kernel(grey: FloatImage, size: int) -> Array:
