@@ -89,8 +89,12 @@ def refused_result(image: FloatImage | None, depth: FloatImage | None) -> Deblur
 
 
 def motion_record(result: DeblurResult, stamp_ns: int, exposure: float | None) -> dict[str, Any]:
-    """Give what stands in motion.json, and in one line of an estimates file."""
-    return {
+    """
+    Give what stands in motion.json, and in one line of an estimates file.
+
+    energies stands there only where the method has some.
+    """
+    record = {
         'stamp': stamp_ns / 1_000_000_000,  # of whole numbers: rounded once
         'theta': result.motion.theta.tolist(),
         'v': result.motion.v.tolist(),
@@ -102,6 +106,11 @@ def motion_record(result: DeblurResult, stamp_ns: int, exposure: float | None) -
         'blur_px': float(result.blur_px),
         'seconds': float(result.seconds),
     }
+    if result.energies:
+        record['energies'] = [
+            {'level': e.level, 'step': e.step, 'terms': dict(e.terms)} for e in result.energies
+        ]
+    return record
 
 
 def twist_covariance(result: DeblurResult, exposure: float) -> npt.NDArray[np.float64]:

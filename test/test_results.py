@@ -1,6 +1,15 @@
 """What is said about a frame: signs, blocks, and what may not be said."""
 
-from depth_deblur_ros.core.data import CameraIntrinsics, DeblurResult, Motion, Outcome
+from dataclasses import replace
+import json
+
+from depth_deblur_ros.core.data import (
+    CameraIntrinsics,
+    DeblurResult,
+    EnergyStep,
+    Motion,
+    Outcome,
+)
 from depth_deblur_ros.messages import header_fields
 from depth_deblur_ros.results import (
     CAMERA_INFO,
@@ -148,3 +157,12 @@ def test_the_record_keeps_the_stamp_to_the_microsecond():
     assert len(record['covariance']) == 36
     assert record['exposure'] is None
     assert (record['outcome'], record['sign_resolved'], record['blur_px']) == ('solved', True, 5.5)
+
+
+def test_energies_stand_in_the_record_of_the_method_that_has_them():
+    assert 'energies' not in motion_record(result(), 0, None)
+    steps = (EnergyStep(3, 'before turn 1', {'intensities': 2.0, 'motion': -1.0}),)
+    record = motion_record(replace(result(), energies=steps), 0, None)
+    assert json.loads(json.dumps(record))['energies'] == [
+        {'level': 3, 'step': 'before turn 1', 'terms': {'intensities': 2.0, 'motion': -1.0}}
+    ]

@@ -17,7 +17,14 @@ from dataclasses import dataclass, replace
 import math
 
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
-from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Outcome, Vector
+from depth_deblur_ros.core.data import (
+    CameraIntrinsics,
+    EnergyStep,
+    FloatImage,
+    Motion,
+    Outcome,
+    Vector,
+)
 from depth_deblur_ros.core.energy import (
     difference_term,
     edge_weights,
@@ -51,15 +58,6 @@ SETTLED = 0.005  # relative gain in R of a level that changes nothing any more
 AGAINST = 12.0  # E_L(p) / E_L(0) of a motion that does not explain the image
 
 
-@dataclass(frozen=True)
-class Record:
-    """Energies [grey levels^2, mean over the samples] of one step at a level, term by term."""
-
-    level: int  # 0 = coarsest
-    step: str  # 'turn 1', ...; 'before' and 'after' it, at one mu1
-    terms: Mapping[str, float]
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """The motion p (6,), zero unless solved; its doubt E_L(p) / E_L(0); energies on the way."""
@@ -67,7 +65,7 @@ class Found:
     p: Vector
     outcome: Outcome
     doubt: float
-    trace: tuple[Record, ...]
+    trace: tuple[EnergyStep, ...]
 
     @property
     def quality(self) -> float:
@@ -98,7 +96,7 @@ def alternate(
     p = first_motion(levels, params)
     if blur_length(p, depth, camera) < SHORTEST:
         return Found(np.zeros(6), Outcome.SHARP, 0.0, ())
-    trace: list[Record] = []
+    trace: list[EnergyStep] = []
     still = 0
     for index, level in enumerate(levels):
         problem = LevelProblem.at(level, params)
@@ -197,7 +195,7 @@ class LevelProblem:
         }
         return State(p, blur, latent, terms)
 
-    def take_turns(self, p: Vector, index: int, trace: list[Record]) -> tuple[Vector, float]:
+    def take_turns(self, p: Vector, index: int, trace: list[EnergyStep]) -> tuple[Vector, float]:
         """Give the motion after the turns of this level, and the relative gain in R."""
         state = self.answer(p)
         first = self.merit(state)
@@ -240,8 +238,8 @@ class LevelProblem:
         fit = levenberg_marquardt(state.p, bowl, energy, self.norm, steps)
         return tried[-1] if len(fit.energies) > 1 else None
 
-    def record(self, state: State, mu1: float, index: int, step: str) -> Record:
+    def record(self, state: State, mu1: float, index: int, step: str) -> EnergyStep:
         """Write down the terms of (23) in the paper's units."""
         terms = {**state.terms, 'motion': mu1 * self.length(state.p) ** 2}
         unit = GREY_LEVELS**2 / self.level.image.size
-        return Record(index, step, {name: unit * value for name, value in terms.items()})
+        return EnergyStep(index, step, {name: unit * value for name, value in terms.items()})

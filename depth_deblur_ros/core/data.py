@@ -7,6 +7,7 @@ radians, seconds. Pixel centres lie at integers.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 import math
@@ -159,13 +160,28 @@ class Motion:
         return np.concatenate([self.theta, self.v])
 
 
+@dataclass(frozen=True)
+class EnergyStep:
+    """
+    The energy before or after one step at a pyramid level, term by term.
+
+    level 0 is the coarsest; step is 'before turn 1', 'after turn 1', ...; both ends of a turn are
+    told at one weight mu1. Terms in grey levels^2, mean over the samples: (23) of docs/method.md.
+    """
+
+    level: int
+    step: str
+    terms: Mapping[str, float]
+
+
 @dataclass(frozen=True, eq=False)
 class DeblurResult:
     """
     What the solver says about one frame.
 
     image as in RgbdFrame (unchanged unless solved); depth (H, W) float32, filled, no NaN; quality
-    0..1, the trust in the motion; blur_px the mean length of the blur [px]; seconds spent.
+    0..1, the trust in the motion; blur_px the mean length of the blur [px]; seconds spent;
+    energies on the way, of the method that has them.
     """
 
     image: FloatImage
@@ -176,6 +192,7 @@ class DeblurResult:
     quality: float
     blur_px: float
     seconds: float
+    energies: tuple[EnergyStep, ...] = ()
 
 
 def check_exposure(exposure: float | None) -> None:

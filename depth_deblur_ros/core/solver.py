@@ -13,12 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 import time
 
 import cv2
 from depth_deblur_ros.core.alternation import alternate, restore
 from depth_deblur_ros.core.blur import blur_operator
-from depth_deblur_ros.core.data import DeblurResult, FloatImage, Motion, Outcome, RgbdFrame
+from depth_deblur_ros.core.data import (
+    DeblurResult,
+    EnergyStep,
+    FloatImage,
+    Motion,
+    Outcome,
+    RgbdFrame,
+)
 from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.latent import LatentSteps, noise_sigma, restore_latent
@@ -44,9 +52,10 @@ def deblur(
     with _threads(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
         if params.method == 'paper':
-            found = _alternated(frame, depth, params)
-        else:
-            found = blind_start(_grey(frame.image), depth, frame.camera, start)
+            found, energies = _alternated(frame, depth, params)
+            result = _finish(frame, depth, found, params, began)
+            return replace(result, energies=energies)
+        found = blind_start(_grey(frame.image), depth, frame.camera, start)
         return _finish(frame, depth, found, params, began)
 
 
@@ -95,11 +104,13 @@ def _restored(
     return np.ascontiguousarray(sharp[..., 0]) if frame.image.ndim == 2 else sharp
 
 
-def _alternated(frame: RgbdFrame, depth: FloatImage, params: SolverParams) -> Start:
-    """Find the motion by the paper's method."""
+def _alternated(
+    frame: RgbdFrame, depth: FloatImage, params: SolverParams
+) -> tuple[Start, tuple[EnergyStep, ...]]:
+    """Find the motion by the paper's method, with the energies on the way."""
     light = light_from_stored(_colour(frame.image), frame.camera.transfer)
     found = alternate(light, depth, frame.camera, params)
-    return Start(Motion.from_vector(found.p), found.outcome, found.quality)
+    return Start(Motion.from_vector(found.p), found.outcome, found.quality), found.trace
 
 
 def _colour(image: FloatImage) -> FloatImage:
