@@ -12,33 +12,15 @@ import argparse
 from collections.abc import Callable, Sequence
 import itertools
 from pathlib import Path
-import re
 import sys
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from depth_deblur_ros.core.data import DeblurResult, InputError, Outcome, RgbdFrame
-from depth_deblur_ros.core.params import knobs, params_from_mapping, SolverParams
+from depth_deblur_ros.flags import Parser, solver_flags, solver_params, topic
 from tqdm import tqdm
-import yaml
 
 DONE, SOME_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 BAG_LIBRARIES = {'mcap', 'rosbags', 'zstandard'}  # a robot may lack them
-
-
-class _Parser(argparse.ArgumentParser):
-    """Say what is wrong in one line, as for every other bad input."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f'{message} (see {self.prog} --help)')
-
-
-class _RosYaml(yaml.SafeLoader):
-    """Read 1e-05 as a number, as ROS does; YAML 1.1 takes it for text."""
-
-
-_RosYaml.add_implicit_resolver(
-    'tag:yaml.org,2002:float', re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+$'), list('-+0123456789')
-)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,10 +51,10 @@ def replay_main() -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog='depth-deblur', description='Deblur RGB-D images and tell the motion.')
+    parser = Parser(prog='depth-deblur', description='Deblur RGB-D images and tell the motion.')
     commands = parser.add_subparsers(metavar='COMMAND', required=True)
 
-    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> _Parser:
+    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> Parser:
         added = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
         added.set_defaults(run=run)
         return added
@@ -87,12 +69,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _image_flags(parser: _Parser) -> None:
+def _image_flags(parser: Parser) -> None:
     parser.add_argument('rgb', type=Path, help='colour image, 8 bit')
     parser.add_argument('depth', type=Path, help='depth image, 16 bit, registered to the colour')
     parser.add_argument('--camera', type=Path, required=True, help='camera.json')
     parser.add_argument('-o', '--out', type=Path, required=True, metavar='DIR', help='results')
-    _solver_flags(parser)
+    solver_flags(parser)
 
 
 def _image(args: argparse.Namespace) -> int:
@@ -100,7 +82,7 @@ def _image(args: argparse.Namespace) -> int:
     from depth_deblur_ros.folders import read_frame, write_image, write_json
     from depth_deblur_ros.results import motion_record
 
-    params = _solver_params(args)
+    params = solver_params(args)
     frame = read_frame(args.rgb, args.depth, args.camera)
     result = deblur(frame, params)
     write_image(args.out / 'deblurred.png', result.image)
@@ -112,7 +94,7 @@ def _image(args: argparse.Namespace) -> int:
     return SOME_FAILED if result.outcome is Outcome.FAILED else DONE
 
 
-def _sequence_flags(parser: _Parser) -> None:
+def _sequence_flags(parser: Parser) -> None:
     _image_flags(parser)
     parser.add_argument(
         '--frames', type=int, default=15, metavar='N', help='frames in the exposure (default: 15)'
@@ -124,7 +106,7 @@ def _sequence(args: argparse.Namespace) -> int:
     from depth_deblur_ros.core.solver import deblur
     from depth_deblur_ros.folders import read_frame, write_image, write_video
 
-    params = _solver_params(args)
+    params = solver_params(args)
     frame = read_frame(args.rgb, args.depth, args.camera)
     result = deblur(frame, params)
     views = sharp_sequence(result.image, result.depth, result.motion, frame.camera, args.frames)
@@ -138,19 +120,19 @@ def _sequence(args: argparse.Namespace) -> int:
     return SOME_FAILED if result.outcome is Outcome.FAILED else DONE
 
 
-def _bench_flags(parser: _Parser) -> None:
+def _bench_flags(parser: Parser) -> None:
     parser.add_argument('cases', type=Path, help='folder of case folders')
     parser.add_argument('-o', '--out', type=Path, required=True, metavar='RESULTS')
     parser.add_argument(
         '--oracle', action='store_true', help='take the motion from truth/motion.json as known'
     )
-    _solver_flags(parser)
+    solver_flags(parser)
 
 
 def _bench(args: argparse.Namespace) -> int:
     from depth_deblur_ros import bench
 
-    params = _solver_params(args)
+    params = solver_params(args)
     cases = bench.find_cases(args.cases)
     solving = bench.solve_cases(cases, args.out, params, oracle=args.oracle)
     rows = list(tqdm(solving, total=len(cases), unit='case', disable=None))
@@ -160,7 +142,7 @@ def _bench(args: argparse.Namespace) -> int:
     return SOME_FAILED if failed else DONE
 
 
-def _import_flags(parser: _Parser) -> None:
+def _import_flags(parser: Parser) -> None:
     parser.add_argument('folder', type=Path, help='rgb/, depth/ and their lists')
     parser.add_argument('bag', type=Path, help='bag to write')
     camera = parser.add_mutually_exclusive_group()
@@ -181,7 +163,7 @@ def _import_tum(args: argparse.Namespace) -> int:
     return DONE
 
 
-def _replay_flags(parser: _Parser) -> None:
+def _replay_flags(parser: Parser) -> None:
     parser.add_argument('bag', type=Path, help='rosbag2 folder or .mcap file to read')
     parser.add_argument('out', type=Path, help='bag to write')
     parser.add_argument('--estimates', type=Path, metavar='FILE', help='one line of JSON per pair')
@@ -191,7 +173,7 @@ def _replay_flags(parser: _Parser) -> None:
     parser.add_argument(
         '--topics',
         nargs='+',
-        type=_topic,
+        type=topic,
         metavar='NAME=TOPIC',
         help='for colour, depth, info, exposure (default: the usual names, else the only fit)',
     )
@@ -199,21 +181,14 @@ def _replay_flags(parser: _Parser) -> None:
     parser.add_argument('--duration', type=float, metavar='S', help='stop after S seconds')
     parser.add_argument('--all-topics', action='store_true', help='copy the other topics too')
     parser.add_argument('--overwrite', action='store_true', help='replace OUT if it is there')
-    _solver_flags(parser)
-
-
-def _topic(text: str) -> tuple[str, str]:
-    name, equals, topic = text.partition('=')
-    if not (name and equals and topic):
-        raise argparse.ArgumentTypeError(f'{text!r} is not of the form NAME=TOPIC')
-    return name, topic
+    solver_flags(parser)
 
 
 def _replay(args: argparse.Namespace) -> int:
     from depth_deblur_ros.folders import read_camera
     from depth_deblur_ros.replay import replay
 
-    params = _solver_params(args)
+    params = solver_params(args)
     camera = read_camera(args.camera) if args.camera else None
     exposure = camera.exposure if camera and args.exposure_s is None else args.exposure_s
     with tqdm(unit='frame', disable=None) as bar:
@@ -255,44 +230,3 @@ def _painter(folder: Path) -> Callable[[RgbdFrame, DeblurResult], None]:
         write_image(folder / f'{next(numbers):05d}.png', draw_frame(frame, result))
 
     return paint
-
-
-def _solver_flags(parser: _Parser) -> None:
-    """Add --params and one flag for each solver parameter; a flag counts more than the file."""
-    group = parser.add_argument_group('solver parameters')
-    group.add_argument('--params', type=Path, metavar='FILE', help='YAML, as ROS takes it')
-    for knob in knobs():
-        meta = knob.metadata
-        limits = (
-            '|'.join(meta['choices']) if 'choices' in meta else f'{meta["low"]}..{meta["high"]}'
-        )
-        group.add_argument(
-            '--' + knob.name.replace('_', '-'),
-            type=type(knob.default),
-            default=argparse.SUPPRESS,
-            metavar=limits,
-            help=f'{meta["help"]} (default: {knob.default})'.replace('%', '%%'),
-        )
-
-
-def _solver_params(args: argparse.Namespace) -> SolverParams:
-    base = params_from_mapping(_read_params(args.params) if args.params else {})
-    given = {knob.name: getattr(args, knob.name) for knob in knobs() if hasattr(args, knob.name)}
-    return params_from_mapping(given, base)
-
-
-def _read_params(path: Path) -> dict[str, Any]:
-    """Read the solver's part of a ROS parameter file, under /**: ros__parameters:."""
-    from depth_deblur_ros.settings import without_node_values
-
-    try:
-        content = yaml.load(path.read_text(), _RosYaml)
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror}') from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        line = ' '.join(str(error).split())
-        raise InputError(f'{path} is not YAML: {line}') from error
-    try:
-        return without_node_values(content['/**']['ros__parameters'])
-    except (AttributeError, KeyError, TypeError):
-        raise InputError(f'{path} must hold /**: ros__parameters: NAME: VALUE') from None

@@ -1,0 +1,82 @@
+"""
+Flags that commands share, and what they are turned into.
+
+Whatever cannot work raises an InputError of one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import re
+from typing import Any, NoReturn
+
+from depth_deblur_ros.core.data import InputError
+from depth_deblur_ros.core.params import knobs, params_from_mapping, SolverParams
+import yaml
+
+
+class Parser(argparse.ArgumentParser):
+    """Say what is wrong in one line, as for every other bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f'{message} (see {self.prog} --help)')
+
+
+class _RosYaml(yaml.SafeLoader):
+    """Read 1e-05 as a number, as ROS does; YAML 1.1 takes it for text."""
+
+
+_RosYaml.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d+$'), list('-+0123456789')
+)
+
+
+def topic(text: str) -> tuple[str, str]:
+    """Split NAME=TOPIC."""
+    name, equals, topic = text.partition('=')
+    if not (name and equals and topic):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form NAME=TOPIC')
+    return name, topic
+
+
+def solver_flags(parser: Parser) -> None:
+    """Add --params and one flag for each solver parameter; a flag counts more than the file."""
+    group = parser.add_argument_group('solver parameters')
+    group.add_argument('--params', type=Path, metavar='FILE', help='YAML, as ROS takes it')
+    for knob in knobs():
+        meta = knob.metadata
+        limits = (
+            '|'.join(meta['choices']) if 'choices' in meta else f'{meta["low"]}..{meta["high"]}'
+        )
+        group.add_argument(
+            '--' + knob.name.replace('_', '-'),
+            type=type(knob.default),
+            default=argparse.SUPPRESS,
+            metavar=limits,
+            help=f'{meta["help"]} (default: {knob.default})'.replace('%', '%%'),
+        )
+
+
+def solver_params(args: argparse.Namespace) -> SolverParams:
+    """Give the parameters of the line, else of its file, else the defaults."""
+    base = params_from_mapping(_read_params(args.params) if args.params else {})
+    given = {knob.name: getattr(args, knob.name) for knob in knobs() if hasattr(args, knob.name)}
+    return params_from_mapping(given, base)
+
+
+def _read_params(path: Path) -> dict[str, Any]:
+    """Read the solver's part of a ROS parameter file, under /**: ros__parameters:."""
+    from depth_deblur_ros.settings import without_node_values
+
+    try:
+        content = yaml.load(path.read_text(), _RosYaml)
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror}') from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        line = ' '.join(str(error).split())
+        raise InputError(f'{path} is not YAML: {line}') from error
+    try:
+        return without_node_values(content['/**']['ros__parameters'])
+    except (AttributeError, KeyError, TypeError):
+        raise InputError(f'{path} must hold /**: ros__parameters: NAME: VALUE') from None
