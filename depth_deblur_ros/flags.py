@@ -20,6 +20,7 @@ class Parser(argparse.ArgumentParser):
     """Say what is wrong in one line, as for every other bad input."""
 
     def error(self, message: str) -> NoReturn:
+        """Refuse the line; --help tells the rest."""
         raise InputError(f'{message} (see {self.prog} --help)')
 
 
@@ -60,12 +61,12 @@ def solver_flags(parser: Parser) -> None:
 
 def solver_params(args: argparse.Namespace) -> SolverParams:
     """Give the parameters of the line, else of its file, else the defaults."""
-    base = params_from_mapping(_read_params(args.params) if args.params else {})
+    base = params_from_mapping(read_params(args.params) if args.params else {})
     given = {knob.name: getattr(args, knob.name) for knob in knobs() if hasattr(args, knob.name)}
     return params_from_mapping(given, base)
 
 
-def _read_params(path: Path) -> dict[str, Any]:
+def read_params(path: Path) -> dict[str, Any]:
     """Read the solver's part of a ROS parameter file, under /**: ros__parameters:."""
     from depth_deblur_ros.settings import without_node_values
 

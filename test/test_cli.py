@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import cv2
-from depth_deblur_ros import cli
+from depth_deblur_ros import cli, flags
 from depth_deblur_ros.core.params import knobs, SolverParams
 import numpy as np
 import pytest
@@ -83,13 +83,13 @@ def test_a_flag_for_every_parameter():
         flag = '--' + knob.name.replace('_', '-')
         args = cli._parser().parse_args(['bench', 'cases', '-o', 'out', flag, str(knob.default)])
         assert getattr(args, knob.name) == knob.default
-        assert cli._solver_params(args) == SolverParams()
+        assert flags.solver_params(args) == SolverParams()
 
 
 def test_a_flag_counts_more_than_the_file(tmp_path):
     (tmp_path / 'p.yaml').write_text('/**:\n  ros__parameters:\n    threads: 3\n    mode: fast\n')
     argv = ['bench', 'cases', '-o', 'out', '--params', str(tmp_path / 'p.yaml'), '--threads', '5']
-    assert cli._solver_params(cli._parser().parse_args(argv)) == SolverParams(
+    assert flags.solver_params(cli._parser().parse_args(argv)) == SolverParams(
         threads=5, mode='fast'
     )
 
@@ -97,13 +97,13 @@ def test_a_flag_counts_more_than_the_file(tmp_path):
 def test_the_shipped_config_is_a_parameter_file():
     path = Path(__file__).parents[1] / 'config/deblur.yaml'
     args = cli._parser().parse_args(['bench', 'cases', '-o', 'out', '--params', str(path)])
-    assert cli._solver_params(args) == SolverParams()
+    assert flags.solver_params(args) == SolverParams()
 
 
 @pytest.mark.parametrize('text', ['1e-05', '1.0e-05', '0.00001'])
 def test_yaml_numbers_are_read_as_ros_reads_them(tmp_path, text):
     (tmp_path / 'p.yaml').write_text(f'/**:\n  ros__parameters:\n    x: {text}\n')
-    assert cli._read_params(tmp_path / 'p.yaml') == {'x': 1e-05}
+    assert flags.read_params(tmp_path / 'p.yaml') == {'x': 1e-05}
 
 
 @pytest.mark.parametrize(
