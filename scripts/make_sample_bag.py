@@ -65,16 +65,17 @@ def render_frames() -> Iterator[SampleFrame]:
         yield SampleFrame(stamp_of(number), colour, depth, motion)
 
 
-def twist_fields(motion: Motion) -> Fields:
+def twist_fields(motion: Motion, exposure: float = EXPOSURE) -> Fields:
     """Give the geometry_msgs/Twist of the camera's own velocity in its optical frame."""
-    linear, angular = -motion.v / EXPOSURE, -motion.theta / EXPOSURE
+    linear, angular = -motion.v / exposure, -motion.theta / exposure
     return {
         'linear': dict(zip('xyz', linear.tolist(), strict=True)),
         'angular': dict(zip('xyz', angular.tolist(), strict=True)),
     }
 
 
-def _image_fields(pixels: npt.NDArray[Any], encoding: str, header: Fields) -> Fields:
+def picture_fields(pixels: npt.NDArray[Any], encoding: str, header: Fields) -> Fields:
+    """Give the fields of a sensor_msgs/Image."""
     size = {'height': pixels.shape[0], 'width': pixels.shape[1], 'step': pixels.strides[0]}
     return {'header': header, **size, 'encoding': encoding, 'data': pixels.tobytes()}
 
@@ -83,8 +84,8 @@ def write_frame(bag: BagWriter, frame: SampleFrame) -> None:
     """Write the messages of one frame; its exposure comes before it, as from a camera driver."""
     header = header_fields(frame.stamp_ns, FRAME_ID)
     info = camera_info_fields(CAMERA, header)
-    colour = _image_fields(frame.colour, 'rgb8', header)
-    depth = _image_fields(frame.depth, '16UC1', header)
+    colour = picture_fields(frame.colour, 'rgb8', header)
+    depth = picture_fields(frame.depth, '16UC1', header)
     truth = {'header': header, 'twist': twist_fields(frame.motion)}
     opened = frame.stamp_ns - round(EXPOSURE * 5e8)
     bag.write('/camera/rgb/exposure', 'std_msgs/msg/Float32', {'data': EXPOSURE}, opened)

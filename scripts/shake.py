@@ -6,7 +6,7 @@ The picture is the mean of exact views in linear light: it shares nothing with t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
@@ -29,10 +29,11 @@ class Trajectory:
     rest: Array  # (3, 3), the camera's rotation without the swings
     amplitude: Array  # (K, 6): rotation vector [rad], then centre [m]
     phase: Array  # (K, 6)
+    frequency: Array = field(default_factory=lambda: FREQUENCIES)  # (K,), Hz
 
     def pose(self, t: float) -> Pose:
         """Give the camera's pose at time t [s]."""
-        angle = 2 * math.pi * FREQUENCIES[:, None] * t + self.phase
+        angle = 2 * math.pi * self.frequency[:, None] * t + self.phase
         offset = (self.amplitude * np.sin(angle)).sum(axis=0)
         return Pose(self.rest @ rotation_matrix(offset[:3]), offset[3:])
 
@@ -48,6 +49,26 @@ def hand_held(seed: int, turn: float, speed: float, nod: float = -0.14) -> Traje
     amplitude = SHARES[:, None] * rate * math.sqrt(2) / (2 * math.pi * FREQUENCIES[:, None])
     phase = rng.uniform(0, 2 * math.pi, (len(FREQUENCIES), 6))
     return Trajectory(rotation_matrix([nod, 0, 0]), amplitude, phase)
+
+
+def driven(seed: int, turn: float, speed: float) -> Trajectory:
+    """
+    Make a robot's path: slow turns and drives of these greatest rates [rad/s, m/s], vibrations.
+
+    It turns about the vertical and drives to and fro and sideways, as far as the room allows.
+    """
+    rng = np.random.default_rng(seed)
+    frequency = np.array([0.25, 0.6, 9.0])
+    rates = np.array(
+        [
+            [0.02, turn, 0.01, 0.3 * speed, 0.0, speed],
+            [0.05, 0.5 * turn, 0.03, 0.3 * speed, 0.02, 0.4 * speed],
+            [0.08, 0.03, 0.05, 0.01, 0.03, 0.01],
+        ]
+    )
+    amplitude = rates / (2 * math.pi * frequency[:, None])
+    phase = rng.uniform(0, 2 * math.pi, amplitude.shape)
+    return Trajectory(rotation_matrix([-0.1, 0, 0]), amplitude, phase, frequency)
 
 
 def motion_between(first: Pose, middle: Pose, last: Pose) -> Motion:
@@ -77,17 +98,23 @@ def blur_lengths(motion: Motion, depth: Array, camera: CameraIntrinsics) -> Arra
 
 
 def render_blurred(
-    scene: Scene, camera: CameraIntrinsics, path: Trajectory, middle: float, exposure: float
+    scene: Scene,
+    camera: CameraIntrinsics,
+    path: Trajectory,
+    middle: float,
+    exposure: float,
+    *,
+    least: int = MIN_VIEWS,
 ) -> Light:
     """
     Render the linear light (H, W, 3) that comes in during the exposure around the time middle [s].
 
     The mean over views at the mid-points of equal shares of the exposure, one for each pixel of
-    the longest blur and at least MIN_VIEWS.
+    the longest blur and at least this many.
     """
     depth = scene.depth(camera, path.pose(middle)).depth
     longest = blur_lengths(true_motion(path, middle, exposure), depth, camera).max()
-    views = max(MIN_VIEWS, math.ceil(longest))
+    views = max(least, math.ceil(longest))
     total = np.zeros((camera.height, camera.width, 3))
     for k in range(views):
         total += scene.light(camera, path.pose(middle + ((k + 0.5) / views - 0.5) * exposure))
