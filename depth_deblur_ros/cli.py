@@ -59,7 +59,11 @@ def _parser() -> argparse.ArgumentParser:
         added.set_defaults(run=run)
         return added
 
-    _image_flags(command('image', _image, 'one blurred image and its depth: sharp image, motion'))
+    image = command('image', _image, 'one blurred image and its depth: sharp image, motion')
+    _image_flags(image)
+    image.add_argument(
+        '--energy', type=Path, metavar='FILE.svg', help='energy of each turn, of the method paper'
+    )
     _bench_flags(command('bench', _bench, 'folders of images, scored where the truth is known'))
     _import_flags(
         command('import-tum', _import_tum, 'a TUM-format folder into a rosbag2 mcap bag')
@@ -78,15 +82,20 @@ def _image_flags(parser: Parser) -> None:
 
 
 def _image(args: argparse.Namespace) -> int:
+    from depth_deblur_ros.charts import energy_chart
     from depth_deblur_ros.core.solver import deblur
-    from depth_deblur_ros.folders import read_frame, write_image, write_json
+    from depth_deblur_ros.folders import read_frame, write_image, write_json, write_text
     from depth_deblur_ros.results import motion_record
 
     params = solver_params(args)
+    if args.energy and params.method != 'paper':
+        raise InputError(f'--energy needs the method paper, got {params.method}')
     frame = read_frame(args.rgb, args.depth, args.camera)
     result = deblur(frame, params)
     write_image(args.out / 'deblurred.png', result.image)
     write_json(args.out / 'motion.json', motion_record(result, frame.stamp_ns, frame.exposure))
+    if args.energy:
+        write_text(args.energy, energy_chart(result.energies))
     print(
         f'{result.outcome.value}: blur {result.blur_px:.1f} px, quality {result.quality:.2f}, '
         f'{result.seconds:.1f} s; {args.out}/deblurred.png, {args.out}/motion.json'

@@ -227,3 +227,11 @@ def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
     monkeypatch.setattr(cli, '_image', interrupted)
     assert cli.main(['image', 'a', 'b', '--camera', 'c', '-o', 'd']) == cli.INTERRUPTED
     assert capsys.readouterr().err == 'depth-deblur: interrupted\n'
+
+
+def test_the_energy_is_drawn_for_the_method_that_has_one(files, capsys):
+    chart = files / 'out/energy.svg'
+    assert 'method paper' in refusal(image_command(files, '--energy', str(chart)), capsys)
+    quick = ['--method', 'paper', '--levels', '1', '--kernel-size', '5', '--alternations', '1']
+    assert cli.main(image_command(files, *quick, '--energy', str(chart))) in (0, 1)
+    assert chart.read_text().startswith('<svg')
