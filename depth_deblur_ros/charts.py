@@ -22,6 +22,7 @@ Marks = tuple[tuple[float, str], ...]  # where on the axis, and what stands ther
 WIDTH, HEIGHT = 430, 250  # of a panel; CSS pixels, as all lengths below
 LEFT, RIGHT, TOP, BOTTOM = 62, 14, 46, 38
 TICKS = 5  # about so many along an axis
+LEAST = 1e-30  # of a logarithmic axis: less counts as nothing
 MOST_POINTS = 1000  # of a curve: more are thinned evenly
 RAISED = str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹')
 AT_LEVEL = 'level of the pyramid, 0 = coarsest'
@@ -54,7 +55,7 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Curves in one frame; logarithmic draws what is above zero alone."""
+    """Curves in one frame; logarithmic draws what is above LEAST alone."""
 
     title: str
     curves: tuple[Curve, ...]
@@ -135,7 +136,7 @@ class _Axis:
     def place(self, values: Floats | float) -> Floats:
         v = np.asarray(values, np.float64)
         if self.logarithmic:
-            v = np.log10(np.where(v > 0, v, np.nan))
+            v = np.log10(np.where(v > LEAST, v, np.nan))
         return self.start + (v - self.low) / (self.high - self.low) * (self.end - self.start)
 
     def ticks(self) -> list[float]:
@@ -152,7 +153,7 @@ class _Axis:
 def _axis(values: Sequence[Floats], start: float, end: float, logarithmic: bool = False) -> _Axis:
     """Make the axis on which all finite values have their place, with a little room."""
     v = np.concatenate([*values, np.zeros(0)])
-    v = v[np.isfinite(v) & ((v > 0) | (not logarithmic))]
+    v = v[np.isfinite(v) & ((v > LEAST) | (not logarithmic))]
     v = np.log10(v) if logarithmic else v
     low, high = (float(v.min()), float(v.max())) if v.size else (0.0, 1.0)
     room = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
