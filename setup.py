@@ -39,6 +39,7 @@ setup(
         'rosbags>=0.11',
         'mcap>=1.2',
         'zstandard>=0.22',
+        'lz4>=4.0',
     ],
     extras_require={
         'ros': [

@@ -34,12 +34,15 @@ class BagReader:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self._missing: list[str] = []
+        self._stated: int | None = None  # messages, says metadata.yaml
         self._files: list[McapFile] = []
         try:
             for file in self._paths():
                 self._files.append(McapFile(file))
             blocks = [(block, file) for file in self._files for block in file.blocks]
-            self._blocks = sorted(blocks, key=lambda entry: (entry[0][:3], entry[1].name))
+            self._blocks = sorted(
+                blocks, key=lambda entry: (entry[0][:2], entry[1].name, entry[0].record)
+            )
             filled = [block for block, _ in self._blocks if block.end_ns or block.counts]
             if not filled:
                 raise InputError(f'{path} holds no messages; {"; ".join(self.damage) or "empty"}')
@@ -63,8 +66,17 @@ class BagReader:
 
     @property
     def damage(self) -> list[str]:
-        """What could not be read so far, and where."""
-        return [*self._missing, *(note for file in self._files for note in file.damage)]
+        """What could not be read so far, and where; how many messages, when all has been read."""
+        notes = [*self._missing, *(note for file in self._files for note in file.damage)]
+        given = sum(sum(file.given.values()) for file in self._files)
+        if not notes or sum(len(file.given) for file in self._files) < len(self._blocks):
+            return notes
+        stated = [file.stated for file in self._files]
+        known = [count for count in stated if count is not None]
+        total = self._stated if self._missing or len(known) < len(stated) else sum(known)
+        if total is None:
+            return [*notes, f'{given} messages read; nothing tells how many are lost']
+        return [*notes, f'{max(0, total - given)} of {total} messages lost']
 
     def messages(
         self, topics: Collection[str], start_ns: int = 0, end_ns: int | None = None
@@ -96,12 +108,17 @@ class BagReader:
             raise InputError(f'{self.path} does not exist')
         if self.path.is_file():
             return [self.path]
-        found = {p for p in self.path.iterdir() if p.name.endswith(('.mcap', '.mcap.zstd'))}
+        found = {p.name for p in self.path.iterdir() if p.name.endswith(('.mcap', '.mcap.zstd'))}
         if not found:
             raise InputError(f'{self.path} holds no .mcap file: not an mcap bag')
-        listed = set(_listed_files(self.path))
-        self._missing += [f'{p.name} is missing from the bag' for p in sorted(listed - found)]
-        return sorted(found & listed or found)
+        listed, self._stated = _metadata(self.path)
+        self._missing += [f'{name} is missing from the bag' for name in sorted(listed - found)]
+        # A crash leaves a file unlisted, or a packed copy half written beside its original.
+        twice = {f'{name}.zstd' for name in found} | {n.removesuffix('.zstd') for n in listed}
+        unlisted = found - listed - twice
+        if listed:
+            self._missing += [f'{n} is not listed in metadata.yaml' for n in sorted(unlisted)]
+        return [self.path / name for name in sorted(found & listed | unlisted)]
 
 
 def decoded(message: BagMessage) -> Any:
@@ -112,14 +129,14 @@ def decoded(message: BagMessage) -> Any:
         raise InputError(f'a message on {message.topic.name} cannot be read: {error}') from error
 
 
-def _listed_files(folder: Path) -> list[Path]:
-    """Give the files that metadata.yaml names; none where it is missing or damaged."""
+def _metadata(folder: Path) -> tuple[set[str], int | None]:
+    """Give the files and the number of messages of metadata.yaml; nothing where it is damaged."""
     try:
         content = yaml.safe_load((folder / 'metadata.yaml').read_text())
-        names = content['rosbag2_bagfile_information']['relative_file_paths']
-        return [folder / Path(name).name for name in names]
+        bag = content['rosbag2_bagfile_information']
+        return {Path(name).name for name in bag['relative_file_paths']}, int(bag['message_count'])
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
-        return []
+        return set(), None
 
 
 class BagWriter:

@@ -20,7 +20,7 @@ from depth_deblur_ros.flags import Parser, solver_flags, solver_params, topic
 from tqdm import tqdm
 
 DONE, SOME_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-BAG_LIBRARIES = {'mcap', 'rosbags', 'zstandard'}  # a robot may lack them
+BAG_LIBRARIES = {'lz4', 'mcap', 'rosbags', 'zstandard'}  # a robot may lack them
 
 
 def main(argv: Sequence[str] | None = None) -> int:

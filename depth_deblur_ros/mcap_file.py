@@ -1,7 +1,7 @@
 """
 One mcap file, read without trust in its index, so that a damaged one gives what is left.
 
-The chunks of the data section are listed first, without reading what is in them. Chunks, messages
+The blocks of the data section are listed first, without reading what is in them. Chunks, messages
 or the file may be compressed.
 """
 
@@ -9,32 +9,41 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 import struct
 import tempfile
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
+import zlib
 
 from depth_deblur_ros.core.data import InputError
+from depth_deblur_ros.mcap_chunk import unpack, unpack_message, UNPACKING
+from depth_deblur_ros.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    Gap,
+    HEAD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    Record,
+    SCHEMA,
+    STATISTICS,
+    walk,
+)
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Channel, Schema, Statistics
 import zstandard
 
-_MAGIC = b'\x89MCAP0\r\n'
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'  # no CDR begins so: a payload that does is compressed
-_DAMAGE = (  # what the readers of mcap, lz4 and zstd raise over bytes that are not theirs
-    McapError,
-    ValueError,
-    struct.error,
-    RuntimeError,
-    MemoryError,
-    OSError,
-    zstandard.ZstdError,
-)
+_PIECE = 1 << 20
+_DAMAGE = (McapError, ValueError, struct.error, MemoryError, OSError)
 
 
 @dataclass(frozen=True)
@@ -61,22 +70,44 @@ class Block(NamedTuple):
 
     start_ns: int
     end_ns: int
-    offset: int
-    length: int
-    opcode: int
+    record: Record
     counts: Counter[int]
 
 
+@dataclass
+class _Reading:
+    """What reading a block brought: messages by channel, and what was wrong."""
+
+    given: Counter[int] = field(default_factory=Counter)
+    troubles: Counter[str] = field(default_factory=Counter)
+
+    def __str__(self) -> str:
+        return '; '.join(
+            text if count == 1 else f'{count} x {text}' for text, count in self.troubles.items()
+        )
+
+
 class McapFile:
-    """The blocks and topics of one file; what cannot be read is left out and noted in `damage`."""
+    """
+    The blocks and topics of one file; what cannot be read is left out and noted in `damage`.
+
+    `stated` is how many messages the file says it holds, None where it does not say so; `given`
+    how many each block gave that has been read; `lost` how many an index tells of that lie in no
+    block.
+    """
 
     def __init__(self, path: Path) -> None:
         self.name = path.name
         self.blocks: list[Block] = []
         self.topics: dict[int, Topic] = {}
         self.damage: list[str] = []
+        self.stated: int | None = None
+        self.given: dict[Record, int] = {}
+        self.lost = 0
         self._schemas: dict[int, Schema] = {}
-        self._stream = _opened(path)
+        self._indexed: Counter[int] = Counter()  # what an index that comes now tells of
+        self._whole = False  # whether the footer has been seen
+        self._stream = self._opened(path)
         try:
             self._scan()
         except InputError:
@@ -88,16 +119,19 @@ class McapFile:
         self._stream.close()
 
     def read(self, block: Block) -> Iterator[BagMessage]:
-        """Give the messages of a block, in the order of the file, up to the first damage in it."""
-        try:
-            self._stream.seek(block.offset)
-            for record in _records(block.opcode, self._stream.read(block.length)):
-                if isinstance(record, Message):
-                    yield from self._message(record)
-                else:
-                    self._learn(record)
-        except _DAMAGE as error:
-            self._note(f'block at byte {block.offset} cannot be read: {error!r}')
+        """Give the messages of a block, in the order of the file; note what is missing."""
+        reading = _Reading()
+        for opcode, data in self._contents(block.record, reading):
+            if opcode == MESSAGE and (message := self._message(data, reading)):
+                yield message
+        self.given[block.record] = given = reading.given.total()
+        lost = (block.counts - reading.given).total()
+        if reading.troubles or lost:
+            known = f'{lost} of {block.counts.total()} messages lost'
+            told = known if block.counts else f'{given} messages found'
+            kind = 'chunk' if block.record.opcode == CHUNK else 'message'
+            text = '; '.join(filter(None, [str(reading), told]))
+            self._note(f'{kind} at byte {block.record.offset}: {text}')
 
     def count(self, block: Block, topic: str) -> int:
         """Count the messages of a topic in a block by its index; 0 where there is none."""
@@ -106,55 +140,147 @@ class McapFile:
     def _scan(self) -> None:
         size = self._stream.seek(0, 2)
         self._stream.seek(0)
-        if self._stream.read(len(_MAGIC)) != _MAGIC:
+        known = self._stream.read(len(MAGIC)) == MAGIC
+        gaps = self._list_all(size) if known or self.name.endswith(('.mcap', '.zstd')) else []
+        if not (known or self.blocks):
             raise InputError(f'{self.name} ({size} bytes) is not an mcap file')
-        offset, opcode = len(_MAGIC), 0
-        while opcode != Opcode.FOOTER:
-            head = self._stream.read(9)
-            opcode, length = struct.unpack('<BQ', head) if len(head) == 9 else (0, size)
-            offset += 9
-            if offset + length > size:
-                self._note(f'ends within the record at byte {offset} of {size}')
-                break
-            self._list(opcode, offset, length)
-            offset += length
-            self._stream.seek(offset)
-        if not self.topics:  # no summary: what would stand there is in the chunks too
+        for gap, counts in gaps:
+            lost = f', which held {counts.total()} messages' if counts else ''
+            self._note(f'no record can be read from byte {gap.begin} to {gap.end}{lost}')
+            self.lost += counts.total()
+        if not self._whole:
+            self._note(f'ends at byte {size} without a footer: it was cut or never finished')
+        if self.damage or not self.topics:  # what the summary tells stands in the chunks too
             for block in self.blocks:
-                for _ in self.read(block):
+                for _ in self._contents(block.record, _Reading()):
                     pass
 
-    def _list(self, opcode: int, offset: int, length: int) -> None:
-        block = Block(0, 0, offset, length, opcode, Counter())
-        head = self._stream.read(min(16, length)).ljust(16, b'\0')
-        if opcode == Opcode.CHUNK:
-            start, end = struct.unpack('<QQ', head)
-            self.blocks.append(block._replace(start_ns=start, end_ns=end))
-        elif opcode == Opcode.MESSAGE:
-            channel, _, time = struct.unpack('<HIQ', head[:14])
-            counts = Counter({channel: 1})
-            self.blocks.append(block._replace(start_ns=time, end_ns=time, counts=counts))
-        elif opcode == Opcode.MESSAGE_INDEX and self.blocks:
-            self.blocks[-1].counts[struct.unpack('<H', head[:2])[0]] += length // 16
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            for _ in self.read(block):
-                pass
+    def _list_all(self, size: int) -> list[tuple[Gap, Counter[int]]]:
+        """List the blocks; give the gaps between them with what an index says was there."""
+        gaps: list[tuple[Gap, Counter[int]]] = []
+        end = 0
+        try:
+            for found in walk(self._stream, 0, size):
+                end = found.end
+                if isinstance(found, Record):
+                    self._list(found)
+                elif not self._whole:
+                    self._indexed = Counter()
+                    gaps.append((found, self._indexed))
+        except OSError as error:
+            self._note(f'cannot be read from byte {end} on: {error.strerror}')
+        return gaps
 
-    def _learn(self, record: Any) -> None:
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, Channel) and record.schema_id in self._schemas:
-            schema = self._schemas[record.schema_id]
-            text = schema.data.decode(errors='replace')
-            self.topics[record.id] = Topic(
-                record.topic, schema.name, text, record.message_encoding, record.metadata
+    def _list(self, record: Record) -> None:
+        if record.mended and not record.cut:
+            self._note(f'the length of the record at byte {record.offset} was wrong')
+        if record.opcode == CHUNK:
+            start, end, _, _ = CHUNK_HEAD.unpack(self._bytes(record, CHUNK_HEAD.size))
+            self._indexed = Counter()
+            self.blocks.append(Block(start, end, record, self._indexed))
+        elif record.opcode == MESSAGE and not record.cut:
+            head = self._bytes(record, MESSAGE_HEAD.size)
+            channel, _, time, _ = MESSAGE_HEAD.unpack(head)
+            self.blocks.append(Block(time, time, record, Counter({channel: 1})))
+            self._indexed = Counter()
+        elif record.opcode == MESSAGE_INDEX:
+            self._index(self._bytes(record))
+        elif record.opcode in (SCHEMA, CHANNEL):
+            self._learn(record.opcode, self._bytes(record))
+        elif record.opcode == STATISTICS:
+            self._count(self._bytes(record))
+        elif record.opcode == DATA_END:
+            self._check(record)
+        elif record.opcode == FOOTER:
+            self._whole = True
+
+    def _check(self, end: Record) -> None:
+        """Check messages outside of chunks: the file's checksum is their only one."""
+        checksum = int.from_bytes(self._bytes(end), 'little')
+        if checksum and any(block.record.opcode == MESSAGE for block in self.blocks):
+            self._stream.seek(0)
+            found, left = 0, end.offset - HEAD.size
+            while left and (piece := self._stream.read(min(left, _PIECE))):
+                found, left = zlib.crc32(piece, found), left - len(piece)
+            if found != checksum:
+                self._note('the checksum of its data is wrong, so that messages may be altered')
+
+    def _index(self, data: bytes) -> None:
+        """Take in how many messages of a channel the last chunk or gap holds, and their times."""
+        times = [time for time, _ in struct.iter_unpack('<QQ', data[6 : len(data) // 16 * 16 + 6])]
+        self._indexed[int.from_bytes(data[:2], 'little')] += len(times)
+        if self.blocks and self.blocks[-1].counts is self._indexed:
+            block = self.blocks[-1]
+            start, end = min([block.start_ns, *times]), max([block.end_ns, *times])
+            self.blocks[-1] = block._replace(start_ns=start, end_ns=end)
+
+    def _count(self, data: bytes) -> None:
+        try:
+            found = Statistics.read(ReadDataStream(BytesIO(data)))
+        except _DAMAGE:
+            return
+        if found.message_count == sum(found.channel_message_counts.values()):
+            self.stated = found.message_count
+
+    def _contents(self, record: Record, reading: _Reading) -> Iterator[tuple[int, bytes]]:
+        """Give opcode and content of the records in a block."""
+        try:
+            data = self._bytes(record)
+        except OSError as error:
+            reading.troubles[f'cannot be read: {error.strerror}'] += 1
+            return
+        if record.opcode != CHUNK:
+            yield record.opcode, data
+            return
+        content, trouble = unpack(data, record.cut)
+        if trouble:
+            reading.troubles[trouble] += 1
+        stream = BytesIO(content)
+        for found in walk(stream, 0, len(content)):
+            if isinstance(found, Gap):
+                reading.troubles[f'{found.end - found.begin} of its bytes hold no record'] += 1
+            elif not found.cut:
+                inside = content[found.offset : found.end]
+                if found.opcode in (SCHEMA, CHANNEL):
+                    self._learn(found.opcode, inside)
+                yield found.opcode, inside
+
+    def _bytes(self, record: Record, count: int | None = None) -> bytes:
+        self._stream.seek(record.offset)
+        return self._stream.read(record.length if count is None else count)
+
+    def _learn(self, opcode: int, data: bytes) -> None:
+        stream = ReadDataStream(BytesIO(data))
+        try:
+            if opcode == SCHEMA:
+                schema = Schema.read(stream)
+                self._schemas[schema.id] = schema
+                return
+            channel = Channel.read(stream)
+        except _DAMAGE as error:
+            self._note(f'a description of a topic cannot be read: {error!r}')
+            return
+        if described := self._schemas.get(channel.schema_id):
+            text = described.data.decode(errors='replace')
+            self.topics[channel.id] = Topic(
+                channel.topic, described.name, text, channel.message_encoding, channel.metadata
             )
 
-    def _message(self, record: Message) -> Iterator[BagMessage]:
-        if record.channel_id in self.topics:
-            yield BagMessage(record.log_time, self.topics[record.channel_id], _plain(record.data))
-        else:
-            self._note(f'nothing describes channel {record.channel_id}')
+    def _message(self, data: bytes, reading: _Reading) -> BagMessage | None:
+        channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data)
+        payload = data[MESSAGE_HEAD.size :]
+        if channel not in self.topics:
+            reading.troubles[f'a message on channel {channel}, which nothing describes'] += 1
+            return None
+        try:
+            plain = unpack_message(payload) if payload.startswith(_ZSTD_MAGIC) else payload
+        except UNPACKING as error:
+            reading.troubles[
+                f'a message on {self._name(channel)} cannot be unpacked: {error}'
+            ] += 1
+            return None
+        reading.given[channel] += 1
+        return BagMessage(log_ns, self.topics[channel], plain)
 
     def _name(self, channel: int) -> str | None:
         return self.topics[channel].name if channel in self.topics else None
@@ -163,37 +289,24 @@ class McapFile:
         if (note := f'{self.name}: {text}') not in self.damage:
             self.damage.append(note)
 
+    def _opened(self, path: Path) -> BinaryIO:
+        try:
+            return self._unpacked(path) if path.suffix == '.zstd' else path.open('rb')
+        except (OSError, zstandard.ZstdError) as error:
+            raise InputError(f'cannot read {path}: {error}') from error
 
-def _opened(path: Path) -> BinaryIO:
-    try:
-        return _unpacked(path) if path.suffix == '.zstd' else path.open('rb')
-    except (OSError, zstandard.ZstdError) as error:
-        raise InputError(f'cannot read {path}: {error}') from error
-
-
-def _unpacked(path: Path) -> BinaryIO:
-    """Give the content of a packed file as a file that can be searched."""
-    plain: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 (McapFile.close closes it)
-    try:
-        with path.open('rb') as packed:
-            zstandard.ZstdDecompressor().copy_stream(packed, plain)
-    except BaseException:
-        plain.close()
-        raise
-    return plain
-
-
-def _records(opcode: int, data: bytes) -> Iterator[Any]:
-    stream = ReadDataStream(BytesIO(data))
-    if opcode == Opcode.CHUNK:
-        yield from breakup_chunk(Chunk.read(stream), validate_crc=True)
-    elif opcode == Opcode.MESSAGE:
-        yield Message.read(stream, len(data))
-    else:
-        yield (Schema if opcode == Opcode.SCHEMA else Channel).read(stream)
-
-
-def _plain(data: bytes) -> bytes:
-    if not data.startswith(_ZSTD_MAGIC):
-        return data
-    return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    def _unpacked(self, path: Path) -> BinaryIO:
+        """Give the content of a packed file as a file that can be searched."""
+        plain: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
+        try:
+            with path.open('rb') as packed:
+                zstandard.ZstdDecompressor().copy_stream(packed, plain)
+        except zstandard.ZstdError as error:
+            if not plain.tell():
+                plain.close()
+                raise
+            self._note(f'cannot be unpacked behind byte {plain.tell()}: {error}')
+        except BaseException:
+            plain.close()
+            raise
+        return plain

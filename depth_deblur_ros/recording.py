@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from depth_deblur_ros.bag import BagReader, decoded
-from depth_deblur_ros.core.data import InputError
+from depth_deblur_ros.core.data import check_exposure, InputError
 from depth_deblur_ros.frames import Pair
 from depth_deblur_ros.mcap_file import BagMessage
 from depth_deblur_ros.messages import camera_from_msg, stamp_ns
@@ -63,6 +63,19 @@ def first_message(bag: BagReader, topic: str) -> Any:
         except InputError:
             continue
     raise InputError(f'{topic} in {bag.path} holds no message that can be read')
+
+
+def first_camera(bag: BagReader, topic: str) -> Any:
+    """Give the first camera_info that can be used; refuse a bag without one before any work."""
+    refusal = InputError(f'{topic} in {bag.path} holds no message that can be read')
+    for message in bag.messages({topic}):
+        try:
+            info = decoded(message)
+            camera_from_msg(info)
+            return info
+        except InputError as error:
+            refusal = error
+    raise refusal
 
 
 def _usual(bag: BagReader, role: str, *first: str) -> str | None:
@@ -120,9 +133,7 @@ class PairReader:
         self._topics = topics
         self._on_message = on_message
         self._pairer: StampPairer[Pair, Any] = StampPairer(slop_ns)
-        self._info = first_message(bag, topics.info) if topics.info else None
-        if self._info:
-            camera_from_msg(self._info)  # refuses a camera without calibration before any work
+        self._info = first_camera(bag, topics.info) if topics.info else None
         self._exposure: float | None = None
         self.dropped: Counter[str] = self._pairer.dropped
 
@@ -145,7 +156,7 @@ class PairReader:
     def _take(self, message: BagMessage) -> Iterator[Pair]:
         name = message.topic.name
         try:
-            content = decoded(message)
+            content = self._checked(name, decoded(message))
         except InputError:
             self.dropped[f'a message on {name} cannot be read'] += 1
             return
@@ -158,6 +169,16 @@ class PairReader:
         else:
             pair = Pair(content, None, self._info, self._exposure, message.log_ns)
             yield from map(_joined, self._pairer.push_colour(stamp_ns(content.header), pair))
+
+    def _checked(self, name: str, content: Any) -> Any:
+        """Refuse what only a damaged message says."""
+        if name == self._topics.exposure:
+            check_exposure(float(content.data))
+        elif content.header.stamp.nanosec >= 1_000_000_000:
+            raise InputError(f'{content.header.stamp.nanosec} ns are no part of a second')
+        elif name == self._topics.info:
+            camera_from_msg(content)
+        return content
 
 
 def _joined(found: tuple[Pair, Any]) -> Pair:

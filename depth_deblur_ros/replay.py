@@ -23,7 +23,7 @@ from depth_deblur_ros.core.data import (
 )
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur
-from depth_deblur_ros.frames import Given, solve_pair, SolvedPair, Solver
+from depth_deblur_ros.frames import Given, solve_anyhow, SolvedPair, Solver
 from depth_deblur_ros.mcap_file import BagMessage
 from depth_deblur_ros.messages import stamp_ns
 from depth_deblur_ros.recording import choose_topics, PairReader, Topics
@@ -100,7 +100,7 @@ def replay(
             pairs = PairReader(reader, names, round(sync_slop_s * 1e9), copy)
             summary = ReplaySummary(dropped=pairs.dropped)
             for pair in pairs.pairs(*span):
-                solved = solve_pair(pair, Given(camera, exposure_s), params, solve)
+                solved = solve_anyhow(pair, Given(camera, exposure_s), params, solve)
                 _write(writer, lines, solved)
                 summary.count(solved)
                 if on_frame and solved.frame and not solved.reason:
@@ -122,7 +122,8 @@ def _span(reader: BagReader, start: float, duration: float | None) -> tuple[int,
     if duration is not None and not 0 < duration < MAX_DURATION_S:
         raise InputError(f'duration must lie in (0, {MAX_DURATION_S:g}) s, got {duration}')
     start_ns = reader.start_ns + round(start * 1e9)
-    return start_ns, None if duration is None else start_ns + round(duration * 1e9)
+    end_ns = None if duration is None else start_ns + round(duration * 1e9)
+    return start_ns if start else 0, end_ns  # the times of a damaged bag are not to be trusted
 
 
 def _copier(writer: BagWriter) -> Callable[[BagMessage], None]:

@@ -141,7 +141,7 @@ def test_links_lead_somewhere(name):
 
 
 def test_the_core_works_without_ros_and_bag_libraries():
-    blocked = sorted(ROS | {'mcap', 'mcap_ros2', 'rosbags', 'zstandard', 'yaml', 'tqdm'})
+    blocked = sorted(ROS | {'lz4', 'mcap', 'mcap_ros2', 'rosbags', 'zstandard', 'yaml', 'tqdm'})
     code = f"""
 import sys
 sys.modules.update(dict.fromkeys({blocked}))
