@@ -170,7 +170,7 @@ def test_a_sharp_frame_passes_unchanged(room):
     assert result.outcome is Outcome.SHARP
     np.testing.assert_array_equal(result.image, room.sharp)
     assert not result.motion.vector.any()
-    assert (result.blur_px, result.sign_resolved) == (0, True)
+    assert (result.blur_px, result.sign_resolved) == (0, False)
 
 
 @pytest.mark.parametrize('colours', [(), (3,)])

@@ -44,8 +44,8 @@ def deblur(
     Find the sharp image and the camera's motion during the exposure of one frame.
 
     start: a further motion to start from (the previous frame's, say). Pure: the same input gives
-    the same output, but for seconds. One image cannot tell the sign of the motion, so
-    sign_resolved is False unless there is no motion. Raises InputError when all depth is missing.
+    the same output, but for seconds. One image cannot tell the sign of the motion, and no motion
+    has none: sign_resolved is False. Raises InputError when all depth is missing.
     """
     params = params or SolverParams()
     began = time.monotonic()
@@ -80,7 +80,7 @@ def _finish(
         depth=depth,
         motion=found.motion,
         outcome=found.outcome,
-        sign_resolved=found.outcome is Outcome.SHARP,
+        sign_resolved=False,
         quality=found.quality,
         blur_px=blur_length(found.motion.vector, depth, frame.camera),
         seconds=time.monotonic() - began,
