@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+import re
 from typing import Any
 
 from depth_deblur_ros.frames import SolvedPair
@@ -21,6 +22,19 @@ SILENCE_S = 5.0  # after this a warning
 WINDOW_S = 5.0  # of the rates
 SAMPLES = 500  # of the latencies
 OK, WARN = 0, 1
+
+
+class Said:
+    """Which warnings have been given lately."""
+
+    def __init__(self) -> None:
+        self._when: dict[str, float] = {}
+
+    def is_new(self, text: str, now: float) -> bool:
+        """Whether this text, whatever its numbers, has not been given for long; it is now."""
+        kind = re.sub(r'\d+', '', text)
+        self._when = {k: t for k, t in self._when.items() if now - t < SILENCE_S}
+        return self._when.setdefault(kind, now) == now
 
 
 class Meter:
@@ -45,7 +59,12 @@ class Meter:
 
 @dataclass
 class Stream:
-    """What came on one topic; lost is what the transport says, mismatch a QoS policy."""
+    """
+    What came on one topic; mismatch is a QoS policy.
+
+    lost counts the messages that were sent and did not get here, by the numbers that a publisher
+    gives them; where there are none, or several publishers, by what the transport says.
+    """
 
     topic: str
     needed: bool = True
@@ -53,6 +72,23 @@ class Stream:
     lost: int = 0
     publishers: int = 0
     mismatch: str = ''
+    _matched: int = 0
+    _number: int | None = None
+
+    def match(self, publishers: int) -> None:
+        """Count by the numbers of whoever publishes from now on."""
+        self._matched, self._number = publishers, None
+
+    def follow(self, number: int | None) -> None:
+        """Count what is missing before the message of this number."""
+        before, self._number = self._number, number if self._matched == 1 else None
+        if before is not None and self._number is not None:
+            self.lost += max(0, self._number - before - 1)
+
+    def miss(self, count: int) -> None:
+        """Count what the transport says is lost."""
+        if self._number is None:
+            self.lost += count
 
     def trouble(self, now: float, began: float) -> str:
         """Say why nothing comes, if nothing has come for long."""
@@ -103,6 +139,7 @@ class Health:
             self.streams[role] = Stream(topic)
         self.streams[role].needed = needed
         self.streams[role].mismatch = ''
+        self.streams[role].match(0)
         return self.streams[role]
 
     def arrived(self, role: str, now: float) -> None:

@@ -30,6 +30,7 @@ KEPT = 30  # frames that may wait for their depth: a second of 30 Hz
 KEPT_INFOS = 30
 # glibc's M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_TOP_PAD, bytes: an image's memory stays with the
 # process, so that the next one does not pay for its pages again.
+_SOLVING = threading.Lock()  # numba's plainest thread pool breaks when two threads call it
 _MALLOPT = ((-1, 1 << 28), (-3, 1 << 25), (-2, 1 << 24))
 
 
@@ -87,26 +88,36 @@ class Mailbox(Generic[T]):
 
 
 class Worker(Generic[T]):
-    """One thread that works on what comes into the mailbox; work must not raise."""
+    """
+    One thread that works on what comes into the mailbox; work and first must not raise.
+
+    Of all workers of a process one works at a time. None keeps the process from ending.
+    """
 
     def __init__(
         self, mailbox: Mailbox[T], work: Callable[[T], None], first: Callable[[], None]
     ) -> None:
         self._mailbox, self._work, self._first = mailbox, work, first
         self.ready = False
-        self._thread = threading.Thread(target=self._run, name='solver')
+        self._thread = threading.Thread(target=self._run, name='solver', daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Wait for the work at hand and end the thread."""
+        """Let the thread end after the work at hand, without waiting for it."""
         self._mailbox.close()
-        self._thread.join()
 
     def _run(self) -> None:
-        self._first()
+        with _SOLVING:
+            self._first()
         self.ready = True
         while (item := self._mailbox.take()) is not None:
-            self._work(item)
+            with _SOLVING:
+                self._work(item)
+
+
+def end_work(patience_s: float) -> bool:
+    """Let no worker begin anything any more; give whether all have ended within this time."""
+    return _SOLVING.acquire(timeout=patience_s)
 
 
 class InfoHistory:

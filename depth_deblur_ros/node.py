@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import Field
 from functools import partial
-import re
+import os
 import signal
 import threading
 import time
@@ -19,8 +19,8 @@ from typing import Any
 from depth_deblur_ros.core.data import InputError
 from depth_deblur_ros.core.solver import deblur
 from depth_deblur_ros.frames import SolvedPair, Solver
-from depth_deblur_ros.health import OK, SILENCE_S, Stream
-from depth_deblur_ros.live import compile_kernels, keep_freed_memory
+from depth_deblur_ros.health import OK, Said, Stream
+from depth_deblur_ros.live import compile_kernels, end_work, keep_freed_memory
 from depth_deblur_ros.messages import compressed_fields, Fields, filled, stamp_ns
 from depth_deblur_ros.pipeline import Pipeline
 from depth_deblur_ros.results import DEPTH, IMAGE, TYPES
@@ -53,6 +53,7 @@ IDLE, CHANGED = 'the last subscriber left', 'the input topics were changed'
 COMPRESSED = f'{IMAGE}/compressed'
 PICTURES = (IMAGE, DEPTH, COMPRESSED)
 DONE, REFUSED = 0, 2  # exit codes
+PATIENCE_S = 0.5  # for the frame that is being solved at the end
 _CLASSES: dict[str, Any] = {
     f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}': kind
     for kind in (
@@ -75,7 +76,7 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
         self._active = False
         self._pipeline: Pipeline | None = None  # while configured
         self._inputs: list[Any] = []
-        self._said: dict[str, float] = {}  # warnings and when
+        self._said = Said()
         self._outputs: dict[str, Any] = {}
         self._settings = self._accepted = self._declare()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -117,7 +118,7 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
     on_shutdown = on_cleanup
 
     def release(self) -> None:
-        """Stop the work, wait for the frame at hand, remove the publishers."""
+        """Stop the work, without a word about the frame at hand; remove the publishers."""
         self._active = False
         self._unsubscribe(INACTIVE)
         if self._pipeline:
@@ -184,7 +185,8 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
             self._unsubscribe(IDLE)
 
     def _is_heard(self, topic: str) -> bool:
-        return bool(self._outputs[topic].get_subscription_count() > 0)
+        output = self._outputs.get(topic)
+        return bool(output and output.get_subscription_count() > 0)
 
     def _subscribe(self) -> None:
         assert self._pipeline
@@ -198,21 +200,21 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
         def mismatch(event: Any) -> None:
             stream.mismatch = qos_policy_name_from_kind(event.last_policy_kind)
 
-        def lost(event: Any) -> None:
-            stream.lost += event.total_count_change
-
         return self.create_subscription(
             kind,
             stream.topic,
-            partial(self._take, role),
+            partial(self._take, role, stream),
             QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT),
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=mismatch, message_lost=lost
+                incompatible_qos=mismatch,
+                message_lost=lambda event: stream.miss(event.total_count_change),
+                matched=lambda event: stream.match(event.current_count),
             ),
             qos_overriding_options=_OVERRIDES,
         )
 
-    def _take(self, role: str, msg: Any) -> None:
+    def _take(self, role: str, stream: Stream, msg: Any, info: dict[str, Any]) -> None:
+        stream.follow(info.get('publication_sequence_number'))
         if self._pipeline:
             self._pipeline.take(role, msg)
             if self._pipeline.undecided and self._slop_timer.is_canceled():
@@ -251,9 +253,7 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
 
     def warn(self, text: str) -> None:
         """Tell the user, but the same only now and then."""
-        kind, now = re.sub(r'\d+', '', text), time.monotonic()
-        if self.context.ok() and now - self._said.get(kind, -SILENCE_S) >= SILENCE_S:
-            self._said = {k: t for k, t in self._said.items() if now - t < SILENCE_S} | {kind: now}
+        if self.context.ok() and self._said.is_new(text, time.monotonic()):
             self.get_logger().warning(text)
 
     def _send(self, topic: str, fields: Fields) -> None:
@@ -298,7 +298,7 @@ def main(args: Sequence[str] | None = None, node_type: type[DeblurNode] = Deblur
         # rclpy's own handler, set after this one, ends the spinning; nothing else may interrupt.
         signal.signal(number, lambda *_: told.set())
     keep_freed_memory()
-    node = None
+    node, code = None, DONE
     try:
         rclpy.init(args=args)
         node = node_type()
@@ -311,10 +311,12 @@ def main(args: Sequence[str] | None = None, node_type: type[DeblurNode] = Deblur
     except (InputError, ParameterException, RuntimeError) as error:
         if not told.is_set():
             rclpy.logging.get_logger(NAME).fatal(' '.join(str(error).split()))
-            return REFUSED
+            code = REFUSED
     finally:
         if node:
             node.release()
             node.destroy_node()
         rclpy.try_shutdown()
-    return DONE
+    if not end_work(PATIENCE_S):
+        os._exit(code)  # all that others hear of is closed; a solver cannot be interrupted
+    return code

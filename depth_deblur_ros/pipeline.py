@@ -45,7 +45,8 @@ class Pipeline:
         self._gate, self._sending = threading.Lock(), threading.Lock()
         self._intake = Intake(settings.node.sync_slop_s)
         self._health = Health(self._intake)
-        self._worker = Worker(self._intake.mailbox, self._work, first)
+        self._first = first
+        self._worker = Worker(self._intake.mailbox, self._work, self._prepare)
 
     def use(self, settings: Settings) -> None:
         """Take settings for the next frame."""
@@ -96,7 +97,8 @@ class Pipeline:
             self._intake.clear(reason)
 
     def stop(self) -> None:
-        """Wait for the frame at hand and end the worker."""
+        """Let the worker end; the frame at hand is not waited for and does not go out."""
+        self.clear('the node was stopped')
         self._worker.stop()
 
     def status(self, name: str, state: str) -> Fields:
@@ -114,6 +116,12 @@ class Pipeline:
         except InputError as error:
             self._outlet.warn(str(error))
 
+    def _prepare(self) -> None:
+        try:
+            self._first()
+        except Exception as error:  # each frame will tell, too
+            self._outlet.warn(f'the solver cannot be prepared: {type(error).__name__}: {error}')
+
     def _work(self, pair: Pair) -> None:
         """Solve a pair and send what came of it; whatever happens, the next one has its turn."""
         try:
@@ -124,9 +132,11 @@ class Pipeline:
                     self._count(solved, age)
         except Exception as error:
             with self._gate:
-                if self._intake.mailbox.finish():
+                counts = self._intake.mailbox.finish()
+                if counts:
                     self._intake.drop(f'not published: {type(error).__name__}')
-            self._outlet.warn(f'a result was not published: {error}')
+            if counts:
+                self._outlet.warn(f'a result was not published: {error}')
 
     def _solve(self, pair: Pair) -> SolvedPair:
         settings = self._settings

@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from depth_deblur_ros.health import Health, Meter, OK, WARN
+from depth_deblur_ros.health import Health, Meter, OK, Said, Stream, WARN
 from depth_deblur_ros.live import Intake
 from depth_deblur_ros.settings import settings_from
 import pytest
@@ -117,3 +117,34 @@ def test_another_topic_is_counted_anew():
     made.arrived('depth', 1.0)
     assert made.stream('depth', '/depth', True).meter.count == 1
     assert made.stream('depth', '/other', True).meter.count == 0
+
+
+def test_what_is_missing_between_two_messages_is_lost():
+    stream = Stream('/colour')
+    stream.follow(7)  # nobody known to publish yet
+    stream.match(1)
+    for number in (8, 9, 12, 13):
+        stream.follow(number)
+        stream.miss(5)  # the numbers know better
+    assert stream.lost == 2
+    stream.match(1)  # another publisher
+    stream.follow(1000)
+    assert stream.lost == 2
+
+
+def test_without_numbers_the_transport_says_what_is_lost():
+    stream = Stream('/colour')
+    for publishers, numbers in ((2, (1, 50, 2, 51)), (1, (None, None))):
+        stream.match(publishers)
+        for number in numbers:
+            stream.follow(number)
+    stream.miss(3)
+    assert stream.lost == 3
+
+
+def test_a_warning_is_repeated_only_now_and_then():
+    said = Said()
+    assert said.is_new('nothing for 5 s', 0.0)
+    assert not said.is_new('nothing for 6 s', 1.0)
+    assert said.is_new('another', 1.0)
+    assert said.is_new('nothing for 10 s', 5.5)

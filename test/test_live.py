@@ -48,7 +48,32 @@ def test_a_worker_prepares_works_and_stops():
     assert done.wait(5)
     worker.stop()
     assert worker.ready and seen == ['first', 'item']
-    assert threading.active_count() < 10
+
+
+def test_a_stopped_worker_is_not_waited_for_and_the_next_begins_when_it_has_ended():
+    go, seen = threading.Event(), []
+    busy, done = threading.Event(), threading.Event()
+
+    def work(item):
+        busy.set()
+        seen.append(f'begin {item}')
+        assert go.wait(5)
+        seen.append(f'end {item}')
+        if item == 2:
+            done.set()
+
+    boxes = [Mailbox(), Mailbox()]
+    old = Worker(boxes[0], work, lambda: None)
+    boxes[0].offer(1)
+    assert busy.wait(5)
+    old.stop()
+    new = Worker(boxes[1], work, lambda: None)
+    boxes[1].offer(2)
+    assert not done.wait(0.1) and not new.ready
+    go.set()
+    assert done.wait(5)
+    new.stop()
+    assert seen == ['begin 1', 'end 1', 'begin 2', 'end 2']
 
 
 def test_the_camera_info_of_an_image_is_the_latest_that_is_not_newer():

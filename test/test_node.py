@@ -1,5 +1,6 @@
 """The live node in a process of its own, over real DDS; mostly with a solver that is a stub."""
 
+import json
 from pathlib import Path
 import signal
 import sys
@@ -449,6 +450,43 @@ def test_signals_end_it_well_in_the_midst_of_work(peer, start, signals):
         time.sleep(0.1)
     assert node.stop(getattr(signal, f'SIG{signals[-1]}'), timeout=10) == 0
     assert 'rror' not in node.text()
+
+
+@pytest.mark.parametrize('signals', [['INT'], ['TERM'], ['INT', 'INT']])
+def test_signals_do_not_wait_for_a_slow_solver(peer, start, signals):
+    node = start(STUB_SECONDS='100')
+    moves = peer.listen(TwistStamped, 'displacement')
+    peer.send_frame(START)
+    peer.until(lambda: peer.status()[1].get('waiting') == '1')
+    begin = time.monotonic()
+    for name in signals:
+        node.process.send_signal(getattr(signal, f'SIG{name}'))
+        time.sleep(0.05)
+    assert node.wait(30) == 0
+    assert time.monotonic() - begin < 10  # by itself it takes one
+    assert 'rror' not in node.text() and not moves
+
+
+def test_a_large_frame_in_full_does_not_delay_the_end(peer, start, tmp_path):
+    width, height = 1920, 1080
+    camera = {'fx': 1500.0, 'fy': 1500.0, 'cx': 959.5, 'cy': 539.5, 'depth_scale': 1000.0}
+    camera |= {'width': width, 'height': height, 'exposure': None, 'transfer': 'srgb'}
+    path = tmp_path / 'camera.json'
+    path.write_text(json.dumps(camera))
+    node = start('-p', f'camera:={path}', '-p', 'mode:=full', command=ros_parts.NODE)
+    images = peer.listen(Image, 'deblurred/image')
+    peer.until(lambda: peer.status()[0].startswith('nothing on'), 90)  # the solver is ready
+    noise = np.random.default_rng(0).random((height, width, 3), np.float32)
+    noise = np.cumsum(noise - 0.5, axis=1)  # a blur to the right
+    image = (0.5 + 0.1 * (noise[:, 16:] - noise[:, :-16])).clip(0, 1)
+    image = np.pad(image, ((0, 0), (8, 8), (0, 0)), 'edge')
+    peer.send_frame(START, image=image, depth=np.ones((height, width), np.float32), info=False)
+    peer.until(lambda: peer.status()[1].get('waiting') == '1')
+    peer.spin(0.5)
+    begin = time.monotonic()
+    assert node.stop(signal.SIGTERM, timeout=30) == 0
+    assert time.monotonic() - begin < 10
+    assert not images and 'rror' not in node.text()
 
 
 def test_a_killed_node_starts_anew(peer, start):

@@ -15,7 +15,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
 
 SECONDS = float(os.environ.get('SOAK_SECONDS', '180'))
 SETTLED_S = 60.0  # until then buffers and pools still grow to their size
-SLOPE_LIMIT = 0.2  # MB/s; one image that is kept in each second would be 0.9
+SLOPE_LIMIT = 0.02  # MB/s: 72 MB in an hour
+LOSS_LIMIT = 0.01  # none on a machine of its own; a busy one stops processes for longer than QUEUE
 
 
 def memory_mb(pid):
@@ -53,11 +54,7 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
             if process:
                 process.kill()
         peer.close()
-    ros_parts.assert_all_accounted(values)
     lost = {role: int(values[f'{role} lost in transport']) for role in ('colour', 'depth')}
-    assert int(values['arrived']) == sent - lost['colour']
-    assert int(values['depth arrived']) == sent - lost['depth']
-    assert sum(lost.values()) <= 0.001 * sent  # a busy machine may stop a process for long
     late = np.array([s for s in seen if s[0] > min(SETTLED_S, SECONDS / 2)])
     slope = np.polyfit(*late.T, 1)[0]
     figures = {
@@ -66,9 +63,13 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
         'published': int(values['published']),
         'memory [MB]': round(float(late[:, 1].mean())),
         'slope [MB/s]': round(float(slope), 3),
-        'latency p99 [s]': values['latency p99 [s]'],
+        'latency p99 [s]': float(values['latency p99 [s]']),
     }
     record_property('soak', figures)
     sys.stdout.write(f'{figures}\n')
+    ros_parts.assert_all_accounted(values)
+    assert int(values['arrived']) == sent - lost['colour']
+    assert int(values['depth arrived']) == sent - lost['depth']
+    assert sum(lost.values()) <= LOSS_LIMIT * sent, figures
     assert slope < SLOPE_LIMIT, figures
     assert int(values['published']) > 0

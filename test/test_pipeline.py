@@ -140,6 +140,31 @@ def test_an_exposure_that_is_none_is_told_and_forgotten(line, exposure):
     assert line.outlet.published[0].frame.exposure is None
 
 
+def test_a_stop_does_not_wait_for_the_frame_at_hand_which_stays_unsaid(line):
+    line.solver.go.clear()
+    send(line, 1)
+    assert line.solver.busy.wait(5)
+    line.stop()
+    line.solver.go.set()
+    until(lambda: values(line)['dropped: the node was stopped'] == '1')
+    time.sleep(0.05)
+    assert line.outlet.published == line.outlet.warnings == []
+
+
+def test_a_solver_that_cannot_be_prepared_is_told_and_tried_all_the_same():
+    def first():
+        raise OSError('no cache')
+
+    line = Pipeline(settings_from({}), Outlet(), Solver(), first)
+    line.outlet = line._outlet
+    for role in ('colour', 'depth', 'camera_info'):
+        line.stream(role, role, True)
+    send(line, 1)
+    until(lambda: line.outlet.published)
+    line.stop()
+    assert line.outlet.warnings == ['the solver cannot be prepared: OSError: no cache']
+
+
 def test_status_says_that_the_solver_is_not_ready_yet():
     ready = threading.Event()
     line = Pipeline(settings_from({}), Outlet(), Solver(), lambda: ready.wait(5) and None)
