@@ -2,17 +2,11 @@
 
 from contextlib import contextmanager
 
-from depth_deblur_ros.core.blur import (
-    _fill_uncovered,
-    _see,
-    blur_operator,
-    BlurOperator,
-    MAX_SAMPLES,
-    MIN_INVERSE_DEPTH,
-    MIN_SAMPLES,
-)
+from depth_deblur_ros.core.blur import blur_operator, BlurOperator, MAX_SAMPLES, MIN_SAMPLES
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.geometry import flow, normalised_grid
+from depth_deblur_ros.core.seen import _fill_uncovered, _see, MIN_INVERSE_DEPTH
+from depth_deblur_ros.core.sweep import MANY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import config, get_num_threads, set_num_threads
@@ -184,6 +178,23 @@ def test_apply_and_adjoint_are_their_slow_twins(drawn, count):
     np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
 
 
+def test_blocks_that_read_far_apart_are_their_slow_twins():
+    """A near board in a corner moves by 20 px, the wall behind hardly; both lie in one block."""
+    depth = np.full((48, 64), 20, np.float32)
+    depth[10:30, 20:43] = 1
+    blur = blur_operator(Motion(np.zeros(3), [20 / 64, 18 / 64, 0.05]), depth, CAMERA)
+    offsets = blur.sweep.cells[..., 2] * blur.sweep.cells[..., 3]
+    assert (offsets == 4).any()
+    assert ((offsets > 4) & (offsets <= MANY)).any()
+    assert (offsets > MANY).any()
+    matrix, rng = oracle.blur_matrix(blur), np.random.default_rng(0)
+    latent, image = rng.random(blur.latent_shape, np.float32), rng.random((48, 64, 3), np.float32)
+    there, back = blur.apply(latent), blur.adjoint(image)
+    np.testing.assert_allclose(there, oracle.through(matrix, latent, image.shape), atol=TOL)
+    slow = oracle.through(matrix.T, image, latent.shape)
+    np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
+
+
 @given(drawn=blurs())
 @few
 def test_every_pixel_reads_within_the_latent_image(drawn):
@@ -214,11 +225,13 @@ def test_what_is_seen_is_its_slow_twin(seed, samples):
     nearness = 1 / steps_in_depth(rng, (14, 16))[:height, :width].astype(np.float64)
     motion = rng.normal(0, 0.2, 8)
     ray = np.concatenate([np.linspace(-0.6, 0.5, width), np.linspace(-0.4, 0.5, height)])
-    f = rng.normal(0, 3, 2) + nearness[..., None] + rng.normal(0, 0.01, (height, width, 2))
-    seen = np.empty((height, width, samples))
-    _see(nearness, ray, motion, f, seen)
+    parts = rng.normal(0, 3, (1, 4, 1)) + rng.normal(0, 0.01, (height, 4, width))
+    f = np.stack([parts[:, k] + nearness * parts[:, k + 2] for k in (0, 1)], -1)
+    seen = np.empty((height, samples, width + 3))
+    _see(nearness, ray, motion, parts, seen)
     slow = oracle.seen(nearness, ray, motion, f, samples)
-    np.testing.assert_allclose(seen, slow, rtol=1e-6)
+    np.testing.assert_allclose(np.moveaxis(seen[..., :width], 1, 2), slow, rtol=1e-6)
+    assert (seen[..., width:] == seen[..., width - 1 : width]).all()
 
 
 def test_what_an_operator_sees_is_its_slow_twin():

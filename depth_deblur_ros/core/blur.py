@@ -14,10 +14,12 @@ the nearest surface that pixel x sees at t_i, so that near things hide far ones 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
-from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.seen import flow_parts, nearness_of, pack, seen_inverse_depth
+from depth_deblur_ros.core.sweep import Sweep, sweep_of, whole_blocks
 from numba import get_num_threads, njit, prange
 import numpy as np
 import numpy.typing as npt
@@ -26,12 +28,16 @@ MIN_SAMPLES, MAX_SAMPLES = (
     8,
     128,
 )  # instants of one exposure; one per pixel of the longest blur between
-MIN_INVERSE_DEPTH = 1e-4  # 1/m; beyond 10 km nothing moves
+ROUNDING = 1e-3  # px; a blur that much longer than a whole number takes no further instant
 
 
 @dataclass(frozen=True, eq=False)
 class BlurOperator:
-    """A of (motion, depth, camera): apply (h, w, 3) -> (H, W, 3) and adjoint back."""
+    """
+    A of (motion, depth, camera): apply (h, w, 3) -> (H, W, 3) and adjoint back.
+
+    float32 goes by blocks of pixels (sweep.py), float64 pixel by pixel.
+    """
 
     ray: npt.NDArray[np.float32]  # (H + W, ) xn of the columns, then yn of the rows
     motion: npt.NDArray[np.float32]  # (8,): theta, v, fx, fy
@@ -39,19 +45,37 @@ class BlurOperator:
     margin: int
 
     @property
+    def _shape(self) -> tuple[int, int, int]:
+        return *self.inverse_depth.shape[:2], 3
+
+    @property
     def latent_shape(self) -> tuple[int, int, int]:
         """(h, w, 3) of the latent image."""
         height, width = self.inverse_depth.shape[:2]
         return height + 2 * self.margin, width + 2 * self.margin, 3
 
+    @cached_property
+    def sweep(self) -> Sweep:
+        """A laid out for blocks of pixels of colour planes."""
+        height, width = self.inverse_depth.shape[:2]
+        seen = np.moveaxis(self.inverse_depth, 2, 1)
+        if width < whole_blocks(width):
+            seen = np.pad(seen, [(0, 0), (0, 0), (0, whole_blocks(width) - width)], 'edge')
+        flow = flow_parts(self.ray, self.motion, (height, width))
+        return sweep_of(np.ascontiguousarray(seen), flow, self.margin)
+
     def apply(self, latent: FloatImage) -> FloatImage:
         """Blur: A L, (5) of docs/method.md."""
+        if latent.dtype == np.float32:
+            return self._apply_by_blocks(latent)
         blurred = np.empty((*self.inverse_depth.shape[:2], 3), latent.dtype)
         _gather(latent, self.inverse_depth, self.ray, self.motion, self.margin, blurred)
         return blurred
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
         """Give A' B, so that <A L, B> = <L, A' B> to rounding."""
+        if blurred.dtype == np.float32:
+            return self._adjoint_by_blocks(blurred)
         rows = self.inverse_depth.shape[0]
         strips = min(get_num_threads(), rows)
         height, width, _ = self.latent_shape
@@ -76,90 +100,63 @@ class BlurOperator:
         m = self.margin
         return np.ascontiguousarray(latent[m : m + height, m : m + width])
 
+    def _apply_by_blocks(self, latent: FloatImage) -> FloatImage:
+        planes = np.zeros(self.sweep.latent_shape, np.float32)
+        self._latent_of(planes)[:] = np.moveaxis(latent, 2, 0)
+        one = self.sweep.blurred_planes(np.ones(self._shape, np.float32))
+        blurred = self.sweep.gather(planes, one)
+        return np.ascontiguousarray(np.moveaxis(blurred[..., : self._shape[1]], 0, 2))
+
+    def _adjoint_by_blocks(self, blurred: FloatImage) -> FloatImage:
+        planes = self.sweep.adjoint(self.sweep.blurred_planes(blurred))
+        return np.ascontiguousarray(np.moveaxis(self._latent_of(planes), 0, 2))
+
+    def _latent_of(self, planes: FloatImage) -> FloatImage:
+        """Look at the part of latent planes that this operator's latent image is."""
+        height, width, _ = self.latent_shape
+        first = self.sweep.room - self.margin
+        return planes[:, first : first + height, first : first + width]
+
 
 def blur_operator(motion: Motion, depth: FloatImage, camera: CameraIntrinsics) -> BlurOperator:
     """Build A for a motion over the exposure; depth (H, W) filled [m]."""
-    f = flow(motion.vector, depth, camera)
-    longest = float(np.hypot(f[..., 0], f[..., 1]).max())
-    samples = int(np.clip(math.ceil(longest), MIN_SAMPLES, MAX_SAMPLES))
+    ray, packed = pack(motion, camera)
+    flow = flow_parts(ray, packed, depth.shape)
+    longest = math.sqrt(_largest(nearness_of(depth)[:, None], flow)[2])
+    samples = int(np.clip(math.ceil(longest - ROUNDING), MIN_SAMPLES, MAX_SAMPLES))
     seen = seen_inverse_depth(motion, depth, camera, samples)
-    margin = _margin(motion, seen, camera)
-    return BlurOperator(*_rays_and_motion(motion, camera), seen, margin)
+    reach = max(_largest(np.moveaxis(seen, 2, 1), flow)[:2]) / 2
+    # 2 for the interpolation.
+    margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2
+    return BlurOperator(ray, packed, seen, margin)
 
 
-def _margin(motion: Motion, seen: FloatImage, camera: CameraIntrinsics) -> int:
-    """Give how far [px] pixels read, by the nearest and the farthest that each sees."""
-    ends = (flow(motion.vector, 1 / w, camera) for w in (seen.min(axis=2), seen.max(axis=2)))
-    reach = max(float(np.abs(f).max()) / 2 for f in ends)
-    return math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: the interpolation
+def _largest(nearness: FloatImage, flow: FloatImage) -> tuple[float, float, float]:
+    """Give the largest |x| [px], |y| [px] and squared length [px^2] of the flow, w (H, N, W)."""
+    rows = np.empty((nearness.shape[0], 3), np.float32)
+    _largest_of_rows(nearness, flow, rows)
+    x, y, square = rows.max(axis=0).tolist()
+    return x, y, square
 
 
-def seen_inverse_depth(
-    motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
-) -> FloatImage:
-    """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
-    nearness = np.maximum(1 / depth, np.float32(MIN_INVERSE_DEPTH)).astype(np.float32)
-    seen = np.empty((*depth.shape, samples), np.float32)
-    f = flow(motion.vector, depth, camera)
-    _see(nearness, *_rays_and_motion(motion, camera), f, seen)
-    return seen
-
-
-def _rays_and_motion(motion: Motion, camera: CameraIntrinsics) -> tuple[FloatImage, FloatImage]:
-    """Pack what the kernels need of the camera and of the motion."""
-    cols = (np.arange(camera.width) - camera.cx) / camera.fx
-    rows = (np.arange(camera.height) - camera.cy) / camera.fy
-    ray = np.concatenate([cols, rows]).astype(np.float32)
-    return ray, np.concatenate([motion.vector, [camera.fx, camera.fy]]).astype(np.float32)
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _largest_of_rows(nearness, flow, rows):  # type: ignore[no-untyped-def]
+    height, samples, width = nearness.shape
+    for y in prange(height):
+        px = py = square = np.float32(0)
+        for i in range(samples):
+            for x in range(width):
+                w = nearness[y, i, x]
+                dx = flow[y, 0, x] + w * flow[y, 2, x]
+                dy = flow[y, 1, x] + w * flow[y, 3, x]
+                px, py = max(px, abs(dx)), max(py, abs(dy))
+                square = max(square, dx * dx + dy * dy)
+        rows[y, 0], rows[y, 1], rows[y, 2] = px, py, square
 
 
 @njit(cache=True, nogil=True)
 def _instant(i, samples):  # type: ignore[no-untyped-def]
     return np.float32((i + 0.5) / samples - 0.5)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _see(nearness, ray, motion, f, seen):  # type: ignore[no-untyped-def]
-    """Warp the inverse depth to each instant: the nearest wins, what it uncovers is far."""
-    height, width, samples = seen.shape
-    for i in prange(samples):
-        t = _instant(i, samples)
-        view = np.zeros((height, width), np.float32)
-        for y in range(height):
-            for x in range(width):
-                w = nearness[y, x]
-                grow = 1 + t * (motion[0] * ray[width + y] - motion[1] * ray[x] + motion[5] * w)
-                near = w / max(grow, np.float32(0.1))
-                px, py = x + t * f[y, x, 0], y + t * f[y, x, 1]
-                x0, y0 = int(math.floor(px)), int(math.floor(py))
-                for yy in range(max(y0, 0), min(y0 + 2, height)):
-                    for xx in range(max(x0, 0), min(x0 + 2, width)):
-                        view[yy, xx] = max(view[yy, xx], near)
-        _fill_uncovered(view, nearness)
-        for y in range(height):
-            for x in range(width):
-                seen[y, x, i] = view[y, x]
-
-
-@njit(cache=True, nogil=True)
-def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
-    """Give uncovered pixels (0) the farther of their row's next surfaces, if there are any."""
-    height, width = view.shape
-    for y in range(height):
-        x = 0
-        while x < width:
-            if view[y, x] > 0:
-                x += 1
-                continue
-            end = x
-            while end < width and view[y, end] == 0:
-                end += 1
-            left = view[y, x - 1] if x > 0 else np.float32(np.inf)
-            right = view[y, end] if end < width else np.float32(np.inf)
-            far = min(left, right)
-            for k in range(x, end):
-                view[y, k] = far if far < np.inf else nearness[y, k]
-            x = end
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -9,9 +9,9 @@ and (5).
 from __future__ import annotations
 
 import cv2
-from depth_deblur_ros.core.blur import seen_inverse_depth
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion
 from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.seen import seen_inverse_depth
 import numpy as np
 
 MAX_FRAMES = 1000

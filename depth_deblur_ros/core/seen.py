@@ -1,0 +1,114 @@
+"""
+What each pixel sees at each instant of the exposure, so that near things hide far ones.
+
+Notation as in blur.py: N instants t_i, w inverse depth [1/m], flow a + w b over the exposure. The
+kernels take rows of whole blocks (sweep.py), W' pixels for W.
+"""
+
+from __future__ import annotations
+
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
+from depth_deblur_ros.core.sweep import whole_blocks
+from numba import njit, prange
+import numpy as np
+
+MIN_INVERSE_DEPTH = 1e-4  # 1/m; beyond 10 km nothing moves
+LEAST_GROWTH = 0.1  # a surface that comes closer than this share of its depth counts as there
+
+
+def seen_inverse_depth(
+    motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
+) -> FloatImage:
+    """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
+    height, width = depth.shape
+    seen = np.empty((height, samples, whole_blocks(width)), np.float32)
+    ray, packed = pack(motion, camera)
+    _see(nearness_of(depth), ray, packed, flow_parts(ray, packed, depth.shape), seen)
+    return np.moveaxis(seen[..., :width], 1, 2)
+
+
+def nearness_of(depth: FloatImage) -> FloatImage:
+    """Give the inverse depth [1/m] of depth [m]."""
+    return np.maximum(1 / depth, np.float32(MIN_INVERSE_DEPTH)).astype(np.float32)
+
+
+def pack(motion: Motion, camera: CameraIntrinsics) -> tuple[FloatImage, FloatImage]:
+    """Give the rays (W + H,), xn of columns and yn of rows, and (theta, v, fx, fy), float32."""
+    cols = (np.arange(camera.width) - camera.cx) / camera.fx
+    rows = (np.arange(camera.height) - camera.cy) / camera.fy
+    ray = np.concatenate([cols, rows]).astype(np.float32)
+    return ray, np.concatenate([motion.vector, [camera.fx, camera.fy]]).astype(np.float32)
+
+
+def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> FloatImage:
+    """Give a_x, a_y [px], b_x, b_y [px m] of the flow a + w b, (3), as (H, 4, whole blocks)."""
+    height, width = shape
+    beyond = ray[width - 1] + (ray[1] - ray[0]) * np.arange(1, whole_blocks(width) - width + 1)
+    xn = np.concatenate([ray[:width], beyond])[None].astype(np.float32)
+    yn = ray[width:, None]
+    tx, ty, tz, vx, vy, vz, fx, fy = motion
+    parts = np.empty((height, 4, xn.size), np.float32)
+    parts[:, 0] = fx * ((1 + xn * xn) * ty - (tx * xn + tz) * yn)
+    parts[:, 1] = fy * ((ty * yn + tz) * xn - (1 + yn * yn) * tx)
+    parts[:, 2] = fx * (vx - xn * vz)
+    parts[:, 3] = fy * (vy - yn * vz)
+    return parts
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _see(nearness, ray, motion, flow, seen):  # type: ignore[no-untyped-def]
+    """Warp the inverse depth (H, W) to each instant; seen (H, N, W or more) is written."""
+    height, width = nearness.shape
+    samples = seen.shape[1]
+    for i in prange(samples):
+        t = np.float32((i + 0.5) / samples - 0.5)
+        # Cell (y, x) of the four pixels from (y - 1, x - 1) on: its nearest surface.
+        cells = np.zeros((height + 1, width + 1), np.float32)
+        for y in range(height):
+            _mark_row(y, t, nearness, ray, motion, flow, cells)
+        view = np.empty((height, width), np.float32)
+        for y in range(height):
+            above, below = cells[y], cells[y + 1]
+            for x in range(width):
+                view[y, x] = max(above[x], above[x + 1], below[x], below[x + 1])
+        _fill_uncovered(view, nearness)
+        for y in range(height):
+            seen[y, i, :width] = view[y]
+            seen[y, i, width:] = view[y, width - 1]
+
+
+@njit(cache=True, nogil=True)
+def _mark_row(y, t, nearness, ray, motion, flow, cells):  # type: ignore[no-untyped-def]
+    """Move the points of one row and leave each in the cell where it comes to stand."""
+    high, wide = np.float32(cells.shape[0]), np.float32(cells.shape[1])
+    one, least = np.float32(1), np.float32(LEAST_GROWTH)
+    roll = one + t * motion[0] * ray[nearness.shape[1] + y]
+    for x in range(nearness.shape[1]):
+        w = nearness[y, x]
+        growth = roll + t * (motion[5] * w - motion[1] * ray[x])
+        px = np.float32(x + 1) + t * (flow[y, 0, x] + w * flow[y, 2, x])
+        py = np.float32(y + 1) + t * (flow[y, 1, x] + w * flow[y, 3, x])
+        if 0 <= px < wide and 0 <= py < high:
+            row, column = np.uint32(py), np.uint32(px)
+            cells[row, column] = max(cells[row, column], w / max(growth, least))
+
+
+@njit(cache=True, nogil=True)
+def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
+    """Give uncovered pixels (0) the farther of their row's next surfaces, if there are any."""
+    height, width = view.shape
+    for y in range(height):
+        x = 0
+        while x < width:
+            if view[y, x] > 0:
+                x += 1
+                continue
+            end = x
+            while end < width and view[y, end] == 0:
+                end += 1
+            left = view[y, x - 1] if x > 0 else np.float32(np.inf)
+            right = view[y, end] if end < width else np.float32(np.inf)
+            far = min(left, right)
+            for k in range(x, end):
+                view[y, k] = far if far < np.inf else nearness[y, k]
+            x = end

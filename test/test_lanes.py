@@ -1,0 +1,40 @@
+"""Sixteen float32 at once: the same as numpy's, one by one."""
+
+from depth_deblur_ros.core import lanes
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numba import njit
+import numpy as np
+
+numbers = st.floats(-1e6, 1e6, width=32)
+arrays = hnp.arrays(np.float32, (2, 40), elements=numbers)
+places = st.integers(0, 40 - lanes.WIDTH)
+
+
+@njit
+def calculate(a, b, at, out):
+    x, y = lanes.load(a, at), lanes.load(b, at)
+    lanes.store(out, 0, x + y)
+    lanes.store(out, 16, x - y)
+    lanes.store(out, 32, x * y)
+    lanes.store(out, 48, lanes.larger(x, y))
+    lanes.store(out, 64, lanes.smaller(x, y))
+    lanes.store(out, 80, lanes.next_lane(x))
+    lanes.store(out, 96, lanes.splat(b[at]))
+    lanes.store(out, 112, lanes.tent(x))
+    return lanes.last_lane(x), lanes.total(x, np.empty(16, np.float32))
+
+
+@given(pair=arrays, at=places)
+def test_each_lane_calculates_by_itself(pair, at):
+    a, b = pair
+    x, y = (array[at : at + 16] for array in pair)
+    out = np.full(8 * 16 + 1, 7, np.float32)
+    last, total = calculate(a, b, at, out)
+    expected = [x + y, x - y, x * y, np.maximum(x, y), np.minimum(x, y), np.r_[0, x[:-1]]]
+    expected += [np.full(16, y[0]), np.maximum(0, 1 - np.abs(x))]
+    np.testing.assert_allclose(out[:-1].reshape(8, 16), expected, rtol=1e-6)
+    assert out[-1] == 7
+    assert last == x[-1]
+    np.testing.assert_allclose(total, x.sum(dtype=np.float64), rtol=1e-5, atol=1e-5 * 16e6)
