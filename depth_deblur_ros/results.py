@@ -70,7 +70,7 @@ def result_messages(
             yield MOTION, _twist_stamped(motion, exposure, header)
         yield MOTION_WITH_COVARIANCE, _twist_with_covariance(result, exposure, header)
     yield DISPLACEMENT, _twist_stamped(motion, 1.0, header)
-    yield RESULT, _status(result, header, reason)
+    yield RESULT, _status(result, exposure, header, reason)
 
 
 def refused_result(image: FloatImage | None, depth: FloatImage | None) -> DeblurResult:
@@ -150,7 +150,7 @@ def _xyz(vector: Vector, duration: float) -> Fields:
     return {name: 0.0 - float(x) / duration for name, x in zip('xyz', vector, strict=True)}
 
 
-def _status(result: DeblurResult, header: Fields, reason: str) -> Fields:
+def _status(result: DeblurResult, exposure: float | None, header: Fields, reason: str) -> Fields:
     """Give the DiagnosticStatus; reason says why the frame could not be solved at all."""
     failed = result.outcome is Outcome.FAILED
     stamp = header['stamp']
@@ -162,6 +162,8 @@ def _status(result: DeblurResult, header: Fields, reason: str) -> Fields:
         'seconds': f'{result.seconds:.6g}',
         'stamp': f'{stamp["sec"]}.{stamp["nanosec"]:09d}',
     }
+    if exposure is not None:
+        values['exposure'] = f'{exposure:.9g}'
     return {
         'level': _ERROR if reason else _WARN if failed else _OK,
         'name': 'depth_deblur',

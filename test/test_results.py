@@ -141,7 +141,10 @@ def test_the_status_says_what_became_of_the_frame(outcome, reason, level):
         'blur_px': '5.5',
         'seconds': '1.25',
         'stamp': '1305031231.096775000',
+        'exposure': '0.5',
     }
+    unknown = said(result(), exposure=None)[RESULT]['values']
+    assert 'exposure' not in {entry['key'] for entry in unknown}
 
 
 def test_a_frame_that_could_not_be_read_sends_no_picture():
