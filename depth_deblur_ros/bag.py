@@ -7,7 +7,7 @@ A bag is written into a hidden folder beside its target, which takes its name wh
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import heapq
 import itertools
 from pathlib import Path
@@ -37,7 +37,8 @@ class BagReader:
         self._stated: int | None = None  # messages, says metadata.yaml
         self._files: list[McapFile] = []
         try:
-            for file in self._paths():
+            self._found = self._paths()
+            for file in self._found:
                 self._files.append(McapFile(file))
             blocks = [(block, file) for file in self._files for block in file.blocks]
             self._blocks = sorted(
@@ -58,6 +59,11 @@ class BagReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read."""
+        return self._found
 
     def close(self) -> None:
         """Close the files."""
@@ -140,21 +146,33 @@ def _metadata(folder: Path) -> tuple[set[str], int | None]:
 
 
 class BagWriter:
-    """Write a rosbag2 folder (mcap, zstd chunks) that appears under its name when it is whole."""
+    """
+    Write a rosbag2 folder (mcap, zstd chunks) that appears under its name when it is whole.
+
+    Until then it is in a hidden folder beside its target, which goes when the writing ends, or
+    inside a folder that is given and stays.
+    """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._path = Path(path).absolute()
+        self._folder: Path | None = None
         self._connections: dict[str, Connection] = {}
         if self._path.exists() and not overwrite:
             raise InputError(f'{path} exists already; it is replaced only when asked for')
         if self._path.exists() and not (self._path / 'metadata.yaml').is_file():
             raise InputError(f'{path} exists and is not a rosbag2 folder; it is never replaced')
 
+    def inside(self, folder: Path) -> BagWriter:
+        """Write into this folder, on the same disk, until the bag is whole."""
+        self._folder = folder
+        return self
+
     def __enter__(self) -> BagWriter:
         with _writing(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            folder = tempfile.mkdtemp(prefix=f'.{self._path.name}.', dir=self._path.parent)
-            self._hidden = Path(folder)
+            self._hidden = self._folder or Path(
+                tempfile.mkdtemp(prefix=f'.{self._path.name}.', dir=self._path.parent)
+            )
             self._writer = Writer(
                 self._hidden / self._path.name, version=9, storage_plugin=StoragePlugin.MCAP
             )
@@ -167,18 +185,33 @@ class BagWriter:
             if kind is None:
                 with _writing(self._path):
                     self._publish()
-            else:
-                self._writer.abort()
         finally:
-            shutil.rmtree(self._hidden, ignore_errors=True)
+            with suppress(OSError):  # a full disk has been told of already
+                self._writer.abort()
+            if not self._folder:
+                shutil.rmtree(self._hidden, ignore_errors=True)
 
-    def write(self, topic: str, type_name: str, fields: Mapping[str, Any], log_ns: int) -> None:
-        """Append one message, given by its fields; those not named are zero."""
+    def write(self, topic: str, type_name: str, fields: Mapping[str, Any], log_ns: int) -> bytes:
+        """Append one message, given by its fields; those not named are zero. Give its bytes."""
+        data = bytes(_TYPES.serialize_cdr(_message(type_name, fields), type_name))
+        self.write_bytes(topic, type_name, data, log_ns)
+        return data
+
+    def write_bytes(self, topic: str, type_name: str, data: bytes, log_ns: int) -> None:
+        """Append one message of a standard type as it was written before."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, type_name, typestore=_TYPES
             )
-        self._append(topic, log_ns, _TYPES.serialize_cdr(_message(type_name, fields), type_name))
+        self._append(topic, log_ns, data)
+
+    def flush(self) -> None:
+        """Let the file hold all that has been written, whatever happens to this process."""
+        storage: Any = self._writer.storage
+        with _writing(self._path):
+            if storage.chunk.bio.tell():
+                storage.close_chunk()
+            storage.bio.flush()
 
     def copy(self, message: BagMessage) -> None:
         """Append a message of another bag as it is."""

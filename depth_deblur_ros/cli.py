@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-import itertools
 from pathlib import Path
 import sys
 from typing import NoReturn
@@ -190,6 +189,9 @@ def _replay_flags(parser: Parser) -> None:
     parser.add_argument('--duration', type=float, metavar='S', help='stop after S seconds')
     parser.add_argument('--all-topics', action='store_true', help='copy the other topics too')
     parser.add_argument('--overwrite', action='store_true', help='replace OUT if it is there')
+    parser.add_argument(
+        '--resume', action='store_true', help='go on where a run of the same kind was killed'
+    )
     solver_flags(parser)
 
 
@@ -215,6 +217,7 @@ def _replay(args: argparse.Namespace) -> int:
             progress=_progress(bar),
             on_frame=_painter(args.pictures) if args.pictures else None,
             overwrite=args.overwrite,
+            resume=args.resume,
         )
     print(f'{args.out}: {summary}')
     return DONE if summary.complete else SOME_FAILED
@@ -228,14 +231,12 @@ def _progress(bar: tqdm[NoReturn]) -> Callable[[int, int | None], None]:
     return show
 
 
-def _painter(folder: Path) -> Callable[[RgbdFrame, DeblurResult], None]:
-    """Give what writes one picture per frame, numbered in the order of the frames."""
+def _painter(folder: Path) -> Callable[[int, RgbdFrame, DeblurResult], None]:
+    """Give what writes one picture per frame, by its number."""
     from depth_deblur_ros.folders import write_image
     from depth_deblur_ros.report import draw_frame
 
-    numbers = itertools.count()
-
-    def paint(frame: RgbdFrame, result: DeblurResult) -> None:
-        write_image(folder / f'{next(numbers):05d}.png', draw_frame(frame, result))
+    def paint(number: int, frame: RgbdFrame, result: DeblurResult) -> None:
+        write_image(folder / f'{number:05d}.png', draw_frame(frame, result))
 
     return paint

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 import json
 import os
 from pathlib import Path
 import tempfile
-from typing import TextIO
+from typing import Any, Protocol, runtime_checkable
 
 from depth_deblur_ros.bag import BagReader, BagWriter
 from depth_deblur_ros.core.data import (
@@ -23,7 +23,8 @@ from depth_deblur_ros.core.data import (
 )
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur
-from depth_deblur_ros.frames import Given, solve_anyhow, SolvedPair, Solver
+from depth_deblur_ros.frames import Given, Pair, solve_anyhow, Solver
+from depth_deblur_ros.journal import checksum, Done, Journal
 from depth_deblur_ros.mcap_file import BagMessage
 from depth_deblur_ros.messages import stamp_ns
 from depth_deblur_ros.recording import choose_topics, PairReader, Topics
@@ -42,12 +43,12 @@ class ReplaySummary:
     dropped: Counter[str] = field(default_factory=Counter)  # colour frames without a pair
     damage: list[str] = field(default_factory=list)  # what could not be read, and where
 
-    def count(self, solved: SolvedPair) -> None:
-        """Count one pair."""
+    def count(self, outcome: str, reason: str) -> None:
+        """Count one pair; reason says why the solver did not take it."""
         self.pairs += 1
-        self.outcomes[solved.result.outcome] += 1
-        if solved.reason:
-            self.refused[solved.reason] += 1
+        self.outcomes[Outcome(outcome)] += 1
+        if reason:
+            self.refused[reason] += 1
 
     @property
     def complete(self) -> bool:
@@ -61,6 +62,17 @@ class ReplaySummary:
         for title, reasons in (('failed', self.refused), ('dropped', self.dropped)):
             lines += [f'{title} {count}: {reason}' for reason, count in reasons.most_common()]
         return '\n'.join([*lines, *(f'damaged: {note}' for note in self.damage)])
+
+
+@runtime_checkable
+class Memory(Protocol):
+    """A solver that remembers something from frame to frame: what it needs to go on."""
+
+    def state(self) -> Any:
+        """Give all that is remembered, as something that can be pickled."""
+
+    def restore(self, state: Any) -> None:
+        """Remember this, and nothing else."""
 
 
 def replay(
@@ -77,8 +89,9 @@ def replay(
     all_topics: bool = False,
     estimates: Path | None = None,
     progress: Callable[[int, int | None], None] | None = None,
-    on_frame: Callable[[RgbdFrame, DeblurResult], None] | None = None,
+    on_frame: Callable[[int, RgbdFrame, DeblurResult], None] | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     sync_slop_s: float = 0.02,
 ) -> ReplaySummary:
     """
@@ -86,29 +99,42 @@ def replay(
 
     camera counts more than camera_info, an exposure topic more than exposure_s; topics gives names
     for colour, depth, info, exposure; start and duration are seconds from the bag's start;
-    all_topics copies the input's messages too; progress is told the frames done and of how many.
+    all_topics copies the input's messages too; progress is told the frames done and of how many;
+    on_frame is given the frames that were solved now, with their numbers; resume goes on behind
+    the last pair of a run of the same kind that was killed.
     """
     check_exposure(exposure_s)
     if Path(out).resolve() == Path(bag).resolve():
         raise InputError(f'{out} is the bag to read: the results need another name')
+    target = BagWriter(out, overwrite=overwrite)
+    _check_place(estimates)
+    given = Given(camera, exposure_s)
     with BagReader(bag) as reader:
         names = choose_topics(reader, topics or {}, with_info=camera is None)
         span = _span(reader, start, duration)
         total = reader.count(names.colour, *span) or None
-        with BagWriter(out, overwrite=overwrite) as writer, _lines(estimates) as lines:
+        facts = _facts(reader, params, given) | {
+            'topics': asdict(names),
+            'span': span,
+            'all_topics': all_topics,
+            'sync_slop_s': sync_slop_s,
+        }
+        with (
+            Journal(out, facts, resume=resume) as journal,
+            target.inside(journal.folder) as writer,
+        ):
             copy = _copier(writer) if all_topics else None
             pairs = PairReader(reader, names, round(sync_slop_s * 1e9), copy)
             summary = ReplaySummary(dropped=pairs.dropped)
+            work = _Work(writer, journal, solve, params, given, on_frame)
             for pair in pairs.pairs(*span):
-                solved = solve_anyhow(pair, Given(camera, exposure_s), params, solve)
-                _write(writer, lines, solved)
-                summary.count(solved)
-                if on_frame and solved.frame and not solved.reason:
-                    on_frame(solved.frame, solved.result)
+                done = work.finish(pair)
+                summary.count(done.record['outcome'], done.reason)
                 if progress:
                     progress(summary.pairs + summary.dropped.total(), total)
             summary.damage = reader.damage
             _check_some_solved(summary, pairs, names)
+            _write_estimates(estimates, journal)
     return summary
 
 
@@ -136,33 +162,82 @@ def _copier(writer: BagWriter) -> Callable[[BagMessage], None]:
     return copy
 
 
-def _write(writer: BagWriter, lines: TextIO | None, solved: SolvedPair) -> None:
-    for topic, fields in solved.messages():
-        writer.write(f'/{topic}', TYPES[topic], fields, solved.pair.log_ns)
-    if lines:
-        stamp = stamp_ns(solved.pair.colour.header)
+@dataclass
+class _Work:
+    """What is done with each pair: solved, written and noted, or taken from an earlier attempt."""
+
+    writer: BagWriter
+    journal: Journal
+    solve: Solver
+    params: SolverParams
+    given: Given
+    on_frame: Callable[[int, RgbdFrame, DeblurResult], None] | None
+    _drawn: int = 0
+
+    def finish(self, pair: Pair) -> Done:
+        """Do one pair, so that it need not be done again."""
+        memory = self.solve if isinstance(self.solve, Memory) else None
+        found = self.journal.done_before()
+        if found:
+            done, messages = found
+            for message in messages:
+                topic = message.topic
+                self.writer.write_bytes(topic.name, topic.type, message.data, pair.log_ns)
+        else:
+            if memory and self.journal.count == self.journal.earlier > 0:
+                memory.restore(self.journal.state)
+            done = self._solved(pair)
+        self._drawn += done.drawn
+        self.writer.flush()
+        self.journal.add(done, memory.state() if memory and not found else None)
+        return done
+
+    def _solved(self, pair: Pair) -> Done:
+        solved = solve_anyhow(pair, self.given, self.params, self.solve)
+        sent = [
+            self.writer.write(f'/{topic}', TYPES[topic], fields, pair.log_ns)
+            for topic, fields in solved.messages()
+        ]
+        if self.on_frame and solved.frame and not solved.reason:
+            self.on_frame(self._drawn, solved.frame, solved.result)
         exposure = solved.frame.exposure if solved.frame else None
-        lines.write(json.dumps(motion_record(solved.result, stamp, exposure)) + '\n')
+        record = motion_record(solved.result, stamp_ns(pair.colour.header), exposure)
+        drawn = solved.frame is not None and not solved.reason
+        return Done(record, solved.reason, drawn, checksum(sent))
 
 
-@contextmanager
-def _lines(path: Path | None) -> Iterator[TextIO | None]:
-    """Give a text file that takes its name when all is written."""
+def _facts(reader: BagReader, params: SolverParams, given: Given) -> dict[str, Any]:
+    """Give what the results depend on."""
+    files = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in reader.files]
+    return {'bag': files, 'parameters': asdict(params), 'given': asdict(given)}
+
+
+def _check_place(path: Path | None) -> None:
+    """Refuse a place for estimates that cannot be written, before any work."""
     if path is None:
-        yield None
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, hidden = tempfile.mkstemp(prefix=f'.{path.name}.', dir=path.parent, text=True)
+        tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
         raise InputError(f'cannot write {path}: {error.strerror}') from error
+    if path.is_dir():
+        raise InputError(f'cannot write {path}: it is a folder')
+
+
+def _write_estimates(path: Path | None, journal: Journal) -> None:
+    """Write one line for each pair into a file that appears when it is whole."""
+    if path is None:
+        return
+    hidden = path.with_name(f'.{path.name}.unfinished')
     try:
-        with open(handle, 'w', encoding='utf-8') as file:
-            yield file
+        with hidden.open('w', encoding='utf-8') as file:
+            file.writelines(json.dumps(record) + '\n' for record in journal.records())
         os.replace(hidden, path)
-    except BaseException:
-        os.unlink(hidden)
-        raise
+    except OSError as error:
+        with suppress(OSError):
+            hidden.unlink()
+        raise InputError(f'cannot write {path}: {error.strerror}') from error
 
 
 def _check_some_solved(summary: ReplaySummary, pairs: PairReader, names: Topics) -> None:
