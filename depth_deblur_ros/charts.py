@@ -55,7 +55,11 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Curves in one frame; logarithmic draws what is above LEAST alone."""
+    """
+    Curves in one frame.
+
+    logarithmic draws what is above LEAST alone; limits, where given, have their place on y.
+    """
 
     title: str
     curves: tuple[Curve, ...]
@@ -63,6 +67,7 @@ class Panel:
     y_label: str
     logarithmic: bool = False
     marks: Marks = ()  # instead of the ticks of the x axis
+    limits: tuple[float, float] | None = None
 
 
 def chart(panels: Sequence[Panel], columns: int = 3, title: str = '') -> str:
@@ -81,7 +86,13 @@ def chart(panels: Sequence[Panel], columns: int = 3, title: str = '') -> str:
 
 
 def energy_chart(energies: Sequence[EnergyStep]) -> str:
-    """Draw the energy before and after each turn, level by level, and its terms below."""
+    """Draw the energy before and after each turn, level by level, and its terms beside it."""
+    title = 'The energy, before and after each turn of motion and image, coarse to fine'
+    return chart(energy_panels(energies), 2, title)
+
+
+def energy_panels(energies: Sequence[EnergyStep]) -> tuple[Panel, Panel]:
+    """Give the panels of energy_chart."""
     turns = np.arange(len(energies) // 2, dtype=np.float64)
     x = np.stack([turns, turns + 0.7, np.full(len(turns), np.nan)], 1).ravel()
     at_level = [step.level for step in energies[::2]]
@@ -92,28 +103,24 @@ def energy_chart(energies: Sequence[EnergyStep]) -> str:
     names = list(energies[0].terms) if energies else []
     terms = [_over_turns([abs(step.terms[name]) for step in energies]) for name in names]
     label = 'grey levels² per sample'
-    return chart(
-        [
-            Panel(
-                'Energy over each turn, mu1 renewed before it',
-                (Curve('E', x, total),),
-                AT_LEVEL,
-                label,
-                marks=marks,
-            ),
-            Panel(
-                'Its terms; of motion the size of its reward',
-                tuple(
-                    Curve(n, x, y, k) for k, (n, y) in enumerate(zip(names, terms, strict=True))
-                ),
-                AT_LEVEL,
-                label,
-                logarithmic=True,
-                marks=marks,
-            ),
-        ],
-        2,
-        'The energy, before and after each turn of motion and image, coarse to fine',
+    total_curve = Curve('E', x, total)
+    term_curves = [Curve(n, x, y, k) for k, (n, y) in enumerate(zip(names, terms, strict=True))]
+    return (
+        Panel(
+            'Energy over each turn, mu1 renewed before it',
+            (total_curve,),
+            AT_LEVEL,
+            label,
+            marks=marks,
+        ),
+        Panel(
+            'Its terms; of motion the size of its reward',
+            tuple(term_curves),
+            AT_LEVEL,
+            label,
+            logarithmic=True,
+            marks=marks,
+        ),
     )
 
 
@@ -163,6 +170,7 @@ def _axis(values: Sequence[Floats], start: float, end: float, logarithmic: bool 
 def _drawn(panel: Panel) -> Iterator[str]:
     """Give the elements of one panel, from the title to the curves."""
     tall = [c.y for c in panel.curves] + [e for c in panel.curves for e in c.band or ()]
+    tall += [np.array(panel.limits)] if panel.limits else []
     xs = _axis([c.x for c in panel.curves], LEFT, WIDTH - RIGHT)
     ys = _axis(tall, HEIGHT - BOTTOM, TOP, panel.logarithmic)
     yield _text(LEFT, 16, panel.title, 'start', 'title')
@@ -191,7 +199,7 @@ def _legend(curves: Sequence[Curve]) -> Iterator[str]:
             continue
         yield f'<circle cx="{x + 4:.0f}" cy="30" r="3.5" fill="var(--c{curve.colour})"/>'
         yield _text(x + 12, 34, curve.name, 'start')
-        x += 20 + 5.4 * len(curve.name)
+        x += 20 + 5.9 * len(curve.name)
 
 
 def _curve(curve: Curve, xs: _Axis, ys: _Axis) -> Iterator[str]:

@@ -39,12 +39,14 @@ HOLE_SHADE = 0.72  # brightness of depth that was filled in
 
 def draw_frame(frame: RgbdFrame, result: DeblurResult) -> Picture:
     """Draw blurred | sharp | filled depth with the flow of the motion, and a caption."""
-    low, high = np.percentile(result.depth, [1, 99])
+    limits = depth_limits(result)
     changed = result.outcome is Outcome.SOLVED
     panels = {
-        'blurred': _fit(_as_rgb(frame.image)),
-        'sharp' if changed else 'unchanged': _fit(_as_rgb(result.image)),
-        'depth, darker where it was a hole': _draw_depth(frame, result, (low, high)),
+        'blurred': draw_image(frame.image),
+        'sharp' if changed else 'unchanged': draw_image(result.image),
+        'depth, darker where it was a hole': _with_paths(
+            draw_depth(frame, result, limits), result, frame.camera
+        ),
     }
     height, width = panels['blurred'].shape[:2]
     size = (HEAD + height + FOOT, 3 * width + 4 * GAP + SCALE, 3)
@@ -54,9 +56,33 @@ def draw_frame(frame: RgbdFrame, result: DeblurResult) -> Picture:
         canvas[HEAD : HEAD + height, left : left + width] = panel
         _write(canvas, title, (left + 2, HEAD - 10), INK)
     bar = canvas[HEAD : HEAD + height, 3 * (width + GAP) + GAP :]
-    _draw_scale(bar, (low, high))
+    _draw_scale(bar, limits)
     _write_caption(canvas, frame, result)
     return canvas
+
+
+def draw_flow(frame: RgbdFrame, result: DeblurResult) -> Picture:
+    """Draw the sharp image with the path of each point of a grid."""
+    return _with_paths(draw_image(result.image), result, frame.camera)
+
+
+def draw_depth(frame: RgbdFrame, result: DeblurResult, limits: tuple[float, float]) -> Picture:
+    """Colour the filled depth between two limits [m], darker where it was a hole."""
+    coloured = _colours(result.depth, limits)
+    measured = np.isfinite(frame.depth) & (frame.depth > 0)
+    shade = np.where(measured, 1.0, HOLE_SHADE)[..., None]
+    return _fit((coloured * shade).astype(np.uint8))
+
+
+def draw_image(image: FloatImage) -> Picture:
+    """Give an image as it is, in a size that fits a page."""
+    return _fit(_as_rgb(image))
+
+
+def depth_limits(result: DeblurResult) -> tuple[float, float]:
+    """Give the depths [m] between which nearly all of a frame lies."""
+    low, high = np.percentile(result.depth, [1, 99])
+    return float(low), float(high)
 
 
 def summary(results: Sequence[DeblurResult]) -> str:
@@ -103,14 +129,6 @@ def _colours(depth: npt.NDArray[np.floating], limits: tuple[float, float]) -> Pi
     far = np.clip((depth - low) / max(high - low, 1e-6), 0, 1)
     index = np.rint(235 - 215 * far).astype(np.uint8)  # the ends of the map are nearly black
     return np.asarray(cv2.applyColorMap(index, cv2.COLORMAP_TURBO)[..., ::-1], np.uint8)
-
-
-def _draw_depth(frame: RgbdFrame, result: DeblurResult, limits: tuple[float, float]) -> Picture:
-    coloured = _colours(result.depth, limits)
-    measured = np.isfinite(frame.depth) & (frame.depth > 0)
-    shade = np.where(measured, 1.0, HOLE_SHADE)[..., None]
-    picture = _fit((coloured * shade).astype(np.uint8))
-    return _with_paths(picture, result, frame.camera)
 
 
 def _with_paths(picture: Picture, result: DeblurResult, camera: CameraIntrinsics) -> Picture:
