@@ -62,13 +62,15 @@ class Stream:
     """
     What came on one topic; mismatch is a QoS policy.
 
-    lost counts the messages that were sent and did not get here, by the numbers that a publisher
-    gives them; where there are none, or several publishers, by what the transport says.
+    missing counts the messages that were sent and did not get here, by the numbers that a
+    publisher gives them; where there are none, or several publishers, it is lost, which is what
+    the transport says it lost. The others came while the queue was full.
     """
 
     topic: str
     needed: bool = True
     meter: Meter = field(default_factory=Meter)
+    missing: int = 0
     lost: int = 0
     publishers: int = 0
     mismatch: str = ''
@@ -83,12 +85,13 @@ class Stream:
         """Count what is missing before the message of this number."""
         before, self._number = self._number, number if self._matched == 1 else None
         if before is not None and self._number is not None:
-            self.lost += max(0, self._number - before - 1)
+            self.missing += max(0, self._number - before - 1)
 
     def miss(self, count: int) -> None:
         """Count what the transport says is lost."""
+        self.lost += count
         if self._number is None:
-            self.lost += count
+            self.missing += count
 
     def trouble(self, now: float, began: float) -> str:
         """Say why nothing comes, if nothing has come for long."""
@@ -199,7 +202,8 @@ class Health:
         for role, stream in self.streams.items():
             values[f'{role} topic'] = stream.topic
             values[f'{role} arrived'] = stream.meter.count
-            values[f'{role} lost in transport'] = stream.lost
+            values[f'{role} lost in transport'] = stream.missing
+            values[f'{role} lost in a full queue'] = max(0, stream.missing - stream.lost)
             values[f'{role} rate [Hz]'] = f'{stream.meter.rate(now):.2f}'
         values['output rate [Hz]'] = f'{self.published.rate(now):.2f}'
         values |= _percentiles('latency', self._latency) | _percentiles('solver', self._solver)

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
 SECONDS = float(os.environ.get('SOAK_SECONDS', '180'))
 SETTLED_S = 60.0  # until then buffers and pools still grow to their size
 SLOPE_LIMIT = 0.02  # MB/s: 72 MB in an hour
-LOSS_LIMIT = 0.01  # none on a machine of its own; a busy one stops processes for longer than QUEUE
+LOSS_LIMIT = 0.001  # of what is sent, beside what came while a busy machine stopped the node
 
 
 def memory_mb(pid):
@@ -54,12 +54,15 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
             if process:
                 process.kill()
         peer.close()
-    lost = {role: int(values[f'{role} lost in transport']) for role in ('colour', 'depth')}
+    roles = 'colour', 'depth'
+    lost = {role: int(values[f'{role} lost in transport']) for role in roles}
+    queued = {role: int(values[f'{role} lost in a full queue']) for role in roles}
     late = np.array([s for s in seen if s[0] > min(SETTLED_S, SECONDS / 2)])
     slope = np.polyfit(*late.T, 1)[0]
     figures = {
         'sent': sent,
         'lost in transport': lost,
+        'of these in a full queue': queued,
         'published': int(values['published']),
         'memory [MB]': round(float(late[:, 1].mean())),
         'slope [MB/s]': round(float(slope), 3),
@@ -70,6 +73,6 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
     ros_parts.assert_all_accounted(values)
     assert int(values['arrived']) == sent - lost['colour']
     assert int(values['depth arrived']) == sent - lost['depth']
-    assert sum(lost.values()) <= LOSS_LIMIT * sent, figures
+    assert sum(lost.values()) - sum(queued.values()) <= LOSS_LIMIT * sent, figures
     assert slope < SLOPE_LIMIT, figures
     assert int(values['published']) > 0
