@@ -41,6 +41,10 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, _VECTOR)  # type: ignore[no-untyped-call]
 
 
+def _fits(array: Any) -> bool:
+    return bool(array.dtype == types.float32 and array.layout == 'C' and array.ndim == 1)
+
+
 def _address(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     array = context.make_array(kinds[0])(context, builder, value=values[0])
     return builder.bitcast(builder.gep(array.data, [values[1]]), _VECTOR.as_pointer())
@@ -53,7 +57,7 @@ def load(typing: Any, array: Any, index: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return builder.load(_address(context, builder, signature.args, values), align=4)
 
-    return LANES(array, types.intp), build
+    return (LANES(array, types.intp), build) if _fits(array) else None
 
 
 @_instruction  # type: ignore[untyped-decorator]
@@ -65,7 +69,7 @@ def store(typing: Any, array: Any, index: Any, lanes: Any) -> Any:
         builder.store(values[2], place, align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, LANES), build
+    return (types.void(array, types.intp, LANES), build) if _fits(array) else None
 
 
 @_instruction  # type: ignore[untyped-decorator]

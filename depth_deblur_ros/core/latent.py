@@ -16,10 +16,13 @@ even in stored values, not in light, so both the data and the prior are weighted
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 from depth_deblur_ros.core.blur import BlurOperator
 from depth_deblur_ros.core.data import FloatImage
+from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
+from depth_deblur_ros.core.sweep import GUARD, Sweep
 from numba import njit, prange
 import numpy as np
 
@@ -62,105 +65,187 @@ def restore_latent(
     blurred: FloatImage, blur: BlurOperator, transfer: str, sigma: float, steps: LatentSteps
 ) -> FloatImage:
     """Give the sharp image (H, W, 3), stored values, of one under a known blur."""
-    light = light_from_stored(blurred, transfer)
-    noise = 1 / np.square(light_slope(blurred, transfer))
-    full = blurred >= SATURATED
-    latent = blur.widen(light)
+    sweep, (height, width) = blur.sweep, blurred.shape[:2]
+    stored = sweep.blurred_planes(blurred)
+    light = light_from_stored(stored, transfer)
+    full, noise = stored >= SATURATED, 1 / np.square(light_slope(stored, transfer))
+    noise[:, :, width:] = 0
+    latent = sweep.widened(light[:, :, :width])
+    within = sweep.blurred_planes(np.ones_like(blurred))
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for _ in range(steps.outer):
-        missing = light - blur.apply(latent)
+        missing = light - sweep.gather(latent, within)
         # What is saturated says only "at least this": drop it where the model gives more.
         trust = np.where(full & (missing <= 0), np.float32(0), noise)
-        problem = _reweighted(stored_from_light(latent, transfer), blur, transfer, trust, weight)
+        problem = _reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
         latent = _conjugate_gradients(problem, latent, missing, steps.inner)
-    return stored_from_light(blur.crop(latent), transfer)
+    r = sweep.room
+    sharp = stored_from_light(latent[:, r : r + height, r : r + width], transfer)
+    return np.ascontiguousarray(np.moveaxis(sharp, 0, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """(7) with the weights of one reweighting: 1/2 |A L - B|^2_trust + 1/2 <L, links L>."""
+    """
+    (7) with the weights of one reweighting: 1/2 |A L - B|^2_trust + 1/2 <L, links L>.
 
-    blur: BlurOperator
-    trust: FloatImage  # (H, W, 3)
-    links: FloatImage  # (h, w, 4) weights to the neighbours right, below, below right, below left
-    scale: FloatImage  # (h, w, 3) l'^2
+    In planes, as sweep.py lays them out: blurred (3, H, W'), latent (3, h, w).
+    """
 
-    def smoothness(self, x: FloatImage) -> FloatImage:
-        """Give the gradient of the prior's part."""
-        out = np.empty_like(x)
-        _apply_links(x, self.links, self.scale, out)
-        return out
+    sweep: Sweep
+    trust: FloatImage  # (3, H, W')
+    links: FloatImage  # (4, h, w) weights to the neighbours right, below, below right, below left
+    ease: FloatImage  # (3, h, w) 1 / l'^2
 
-    def normal(self, x: FloatImage) -> FloatImage:
-        """Apply the normal equations' matrix."""
-        return self.blur.adjoint(self.trust * self.blur.apply(x)) + self.smoothness(x)
+    def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
+        """Give minus the gradient at a latent image; missing = B - A latent."""
+        strips, r = self.sweep.strips(), np.zeros_like(latent)
+        self.sweep.scatter(self.trust * missing, strips)
+        self._sum(strips, -latent, r)
+        return r
+
+    def normal(self, d: FloatImage, strips: FloatImage, q: FloatImage) -> float:
+        """Write the normal equations' matrix times d into q; give <d, q>."""
+        self.sweep.scatter(self.sweep.gather(d, self.trust), strips)
+        return self._sum(strips, d, q)
+
+    def _sum(self, strips: FloatImage, x: FloatImage, out: FloatImage) -> float:
+        """Add strips of A' and the prior's part of x; give <x, out>."""
+        products = np.zeros(x.shape[1:2], np.float32)
+        rows = self.trust.shape[1]
+        _sum_rows(strips, rows, x, self.links, self.ease, out, products)
+        return float(products.sum(dtype=np.float64))
 
 
 def _reweighted(
-    stored: FloatImage, blur: BlurOperator, transfer: str, trust: FloatImage, weight: np.float32
+    stored: FloatImage, sweep: Sweep, transfer: str, trust: FloatImage, weight: np.float32
 ) -> Quadratic:
-    """Put the weights of (7) at the present image, stored values (h, w, 3)."""
-    links = np.zeros((*stored.shape[:2], 4), np.float32)
-    _link_weights(stored, weight, links)
-    return Quadratic(blur, trust, links, np.square(light_slope(stored, transfer)))
+    """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
+    links = np.zeros((4, *stored.shape[1:]), np.float32)
+    _link_weights(stored, weight, _POWERS, links)
+    ease = (1 / np.square(light_slope(stored, transfer))).astype(np.float32)
+    return Quadratic(sweep, trust, links, ease)
 
 
 def _conjugate_gradients(
     problem: Quadratic, latent: FloatImage, missing: FloatImage, limit: int
 ) -> FloatImage:
     """Solve from latent by `limit` steps, preconditioned with l'^2; missing = B - A latent."""
-    r = problem.blur.adjoint(problem.trust * missing) - problem.smoothness(latent)
-    z = problem.scale * r
-    d, rz = z, float(np.vdot(r, z))
+    latent, r = latent.copy(), problem.slope(missing, latent)
+    d, q, strips = np.zeros_like(r), np.zeros_like(r), problem.sweep.strips()
+    products = np.zeros(r.shape[1], np.float32)
+    _advance(latent, r, d, q, problem.ease, np.float32(0), products)
+    rz, last = float(products.sum(dtype=np.float64)), math.inf
     for _ in range(limit):
         if rz <= 0:
             break
-        q = problem.normal(d)
-        step = np.float32(rz / float(np.vdot(d, q)))
-        latent = np.asarray(latent + step * d, latent.dtype)
-        r = r - step * q
-        z = problem.scale * r
-        rz, last = float(np.vdot(r, z)), rz
-        d = z + np.float32(rz / last) * d
+        _turn(d, r, problem.ease, np.float32(rz / last))
+        step = np.float32(rz / problem.normal(d, strips, q))
+        _advance(latent, r, d, q, problem.ease, step, products)
+        rz, last = float(products.sum(dtype=np.float64)), rz
     return latent
 
 
+# x^(EXPONENT / 2 - 1) from 2^-14 to 2, in even steps within each octave, counted by a float's bits
+POWER_BITS = 6  # 2^6 steps in each octave
+_POWER_FROM, _POWER_SHIFT = (127 - 14) << 23, 23 - POWER_BITS
+_POWERS = (
+    (_POWER_FROM + (np.arange((15 << POWER_BITS) + 2) << _POWER_SHIFT).astype(np.int32))
+    .view(np.float32)
+    .astype(np.float64)
+    ** (EXPONENT / 2 - 1)
+).astype(np.float32)
+
+
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _link_weights(stored, weight, links):  # type: ignore[no-untyped-def]
+def _link_weights(stored, weight, powers, links):  # type: ignore[no-untyped-def]
     """Weigh the links to the neighbours right, below, below right, below left: [IRLS]."""
-    height, width = stored.shape[:2]
-    for y in prange(height):
-        for x in range(width):
-            for k in range(4):
-                yy, xx = y + (k > 0), x + (1 if k in (0, 2) else (-1 if k == 3 else 0))
-                if yy >= height or xx >= width or xx < 0:
-                    continue
-                m = np.float32(0)
+    _, height, width = stored.shape
+    rest_of, mask = np.float32(2.0**-_POWER_SHIFT), np.uint32((1 << _POWER_SHIFT) - 1)
+    third, floor = np.float32(1 / 3), np.float32(EPSILON * EPSILON)
+    for y in prange(GUARD, height - GUARD):
+        mean = np.empty(width, np.float32)
+        bits = mean.view(np.int32)
+        for k in range(4):
+            down, aside = min(k, 1), (1, 0, 1, -1)[k]
+            first, end = max(-aside, 0), width - max(aside, 0)
+            if down and y == height - GUARD - 1:
+                continue
+            mean[:] = 1
+            for x in range(first, end):
+                s = np.float32(0)
                 for c in range(3):
-                    d = stored[yy, xx, c] - stored[y, x, c]
-                    m += d * d
-                m = m / 3 + np.float32(EPSILON * EPSILON)
-                # Diagonal links are longer: half the weight.
-                share = weight if k < 2 else weight / 2
-                links[y, x, k] = share * m ** np.float32(EXPONENT / 2 - 1)
+                    d = stored[c, y + down, x + aside] - stored[c, y, x]
+                    s += d * d
+                mean[x] = third * s + floor
+            # Diagonal links are longer: half the weight.
+            share = weight if k < 2 else weight / 2
+            for x in range(first, end):
+                place = np.uint32(bits[x] - _POWER_FROM)
+                i, rest = place >> np.uint32(_POWER_SHIFT), rest_of * np.float32(place & mask)
+                links[k, y, x] = share * (powers[i] + rest * (powers[i + 1] - powers[i]))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _pull(u, links, ease, p, n, link):  # type: ignore[no-untyped-def]
+    """Give how one link draws the values at p away from their neighbours at n."""
+    return load(links, link) * (load(u, p) - load(u, n)) * smaller(load(ease, p), load(ease, n))
+
+
+@njit(cache=True, nogil=True)
+def _add_prior(y, x, links, ease, out, products, room):  # type: ignore[no-untyped-def]
+    """Add the prior's quadratic form of x to one row of out; all flat but out (3, h, w)."""
+    _, high, wide = out.shape
+    flat, plane = out.reshape(-1), high * wide
+    product = splat(np.float32(0))
+    for k in range(wide // WIDTH):
+        here = y * wide + k * WIDTH
+        for c in range(3):
+            p = c * plane + here
+            s = load(flat, p)
+            for m in range(4):
+                ahead = (1, wide, wide + 1, wide - 1)[m]
+                s += _pull(x, links, ease, p, p + ahead, m * plane + here)
+                s += _pull(x, links, ease, p, p - ahead, m * plane + here - ahead)
+            store(flat, p, s)
+            product += load(x, p) * s
+    products[y] = total(product, room)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sum_rows(strips, rows, x, links, ease, out, products):  # type: ignore[no-untyped-def]
+    """Write the sum of strips of A' (of `rows` rows of B) and the prior's part of x into out."""
+    high = out.shape[1]
+    count, _, depth, _ = strips.shape
+    flat = (x.reshape(-1), links.reshape(-1), ease.reshape(-1))
+    for y in prange(GUARD, high - GUARD):
+        out[:, y] = 0
+        for k in range(count):
+            j = y - np.int64(k) * rows // count
+            if 0 <= j < depth:
+                out[:, y] += strips[k, :, j]
+        _add_prior(y, *flat, out, products, np.empty(WIDTH, np.float32))
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _apply_links(u, links, scale, out):  # type: ignore[no-untyped-def]
-    """Apply the prior's quadratic form: sum of weight (u - u(neighbour)) / slope^2."""
-    height, width = u.shape[:2]
+def _advance(latent, r, d, q, ease, step, products):  # type: ignore[no-untyped-def]
+    """Go along d: latent + step d, r - step q; give <r, r / ease> of each row."""
+    _, height, width = r.shape
     for y in prange(height):
-        for x in range(width):
-            for c in range(3):
-                out[y, x, c] = 0
-            for k in range(8):
-                back = k >= 4
-                dy = (k % 4 > 0) * (-1 if back else 1)
-                dx = (1 if k % 4 in (0, 2) else (-1 if k % 4 == 3 else 0)) * (-1 if back else 1)
-                yy, xx = y + dy, x + dx
-                if yy < 0 or yy >= height or xx < 0 or xx >= width:
-                    continue
-                w = links[yy, xx, k % 4] if back else links[y, x, k]
-                for c in range(3):
-                    steep = max(scale[y, x, c], scale[yy, xx, c])
-                    out[y, x, c] += w * (u[y, x, c] - u[yy, xx, c]) / steep
+        s = np.float32(0)
+        for c in range(3):
+            for x in range(width):
+                latent[c, y, x] += step * d[c, y, x]
+                r[c, y, x] -= step * q[c, y, x]
+                s += r[c, y, x] * r[c, y, x] / ease[c, y, x]
+        products[y] = s
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _turn(d, r, ease, share):  # type: ignore[no-untyped-def]
+    """Turn d to r / ease + share d."""
+    _, height, width = r.shape
+    for y in prange(height):
+        for c in range(3):
+            for x in range(width):
+                d[c, y, x] = r[c, y, x] / ease[c, y, x] + share * d[c, y, x]

@@ -59,6 +59,12 @@ class Sweep:
         planes[:, :, : image.shape[1]] = np.moveaxis(image, 2, 0)
         return planes
 
+    def widened(self, planes: FloatImage) -> FloatImage:
+        """Continue planes (3, H, W) over the latent planes by their border pixels."""
+        _, height, width = self.latent_shape
+        below, right = height - self.room - planes.shape[1], width - self.room - planes.shape[2]
+        return np.pad(planes, [(0, 0), (self.room, below), (self.room, right)], 'edge')
+
     def gather(self, latent: FloatImage, weight: FloatImage) -> FloatImage:
         """Give weight (3, H, W') times A L of latent planes."""
         blurred = np.empty_like(weight)
