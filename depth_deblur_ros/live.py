@@ -225,11 +225,13 @@ class Intake:
 def compile_kernels() -> None:
     """Solve a small frame, so that the first real one need not wait for what is made once."""
     noise = np.random.default_rng(0).random((144, 192, 3), np.float32)
-    image = np.asarray(cv2.blur(noise, (9, 1)), np.float32)
+    image = np.asarray(cv2.blur(noise, (21, 7)), np.float32)  # what is sharp is not searched
     camera = CameraIntrinsics(160.0, 160.0, 95.5, 71.5, 192, 144)
     frame = RgbdFrame(image, np.ones((144, 192), np.float32), camera)
     deblur(frame, SolverParams(mode='motion'))
-    restore_known(frame, Motion(np.array([0.0, 0.05, 0.0]), np.zeros(3)))
+    turn = Motion(np.array([0.0, 0.05, 0.0]), np.zeros(3))
+    for mode in ('fast', 'full'):
+        restore_known(frame, turn, SolverParams(mode=mode))
 
 
 def keep_freed_memory() -> None:

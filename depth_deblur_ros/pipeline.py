@@ -18,6 +18,7 @@ from depth_deblur_ros.frames import Pair, solve_anyhow, SolvedPair, Solver
 from depth_deblur_ros.health import Health, Stream
 from depth_deblur_ros.live import Intake, Worker
 from depth_deblur_ros.messages import Fields, stamp_ns
+from depth_deblur_ros.pace import Pace
 from depth_deblur_ros.settings import Settings
 
 
@@ -45,12 +46,16 @@ class Pipeline:
         self._gate, self._sending = threading.Lock(), threading.Lock()
         self._intake = Intake(settings.node.sync_slop_s)
         self._health = Health(self._intake)
+        self._pace = _pace(settings)
         self._first = first
         self._worker = Worker(self._intake.mailbox, self._work, self._prepare)
 
     def use(self, settings: Settings) -> None:
         """Take settings for the next frame."""
-        self._settings = settings
+        before, self._settings = self._settings, settings
+        deadlines = {s.node.deadline_ms for s in (before, settings)}
+        if before.solver != settings.solver or len(deadlines) > 1:
+            self._pace = _pace(settings)
         self._intake.change_slop(settings.node.sync_slop_s)
 
     def begin(self) -> None:
@@ -106,7 +111,9 @@ class Pipeline:
         if not state and not self._worker.ready:
             state = 'preparing the solver'
         with self._gate:
-            return self._health.status(name, state, self._settings, time.monotonic())
+            fields = self._health.status(name, state, self._settings, time.monotonic())
+        told = [{'key': key, 'value': str(value)} for key, value in self._pace.values().items()]
+        return {**fields, 'values': [*told, *fields['values']]}
 
     def _take_exposure(self, exposure: float) -> None:
         self._intake.exposure = None
@@ -139,11 +146,12 @@ class Pipeline:
                 self._outlet.warn(f'a result was not published: {error}')
 
     def _solve(self, pair: Pair) -> SolvedPair:
-        settings = self._settings
-        pictures = self._outlet.wants_pictures()
-        params = settings.solver if pictures else replace(settings.solver, mode='motion')
+        settings, pace = self._settings, self._pace
+        mode = pace.mode if self._outlet.wants_pictures() else 'motion'
+        params = replace(settings.solver, mode=mode)
         pair = replace(pair, info=self._intake.infos.at(stamp_ns(pair.colour.header)))
         solved = solve_anyhow(pair, settings.given, params, self._solver)
+        pace.note(mode, solved.result)
         if solved.reason:
             self._outlet.warn(solved.trace or solved.reason)
         return solved
@@ -152,3 +160,7 @@ class Pipeline:
         with self._gate:
             self._intake.mailbox.finish()
             self._health.count(solved, age, time.monotonic())
+
+
+def _pace(settings: Settings) -> Pace:
+    return Pace(settings.solver.mode, settings.node.deadline_ms / 1000)

@@ -42,6 +42,9 @@ class NodeParams:
         0.02, 0.0, 1.0, 'how far apart the stamps of colour and depth may be [s]'
     )
     exposure_s: float = knob(0.0, 0.0, 60.0, 'exposure where no topic tells it; 0 = unknown [s]')
+    deadline_ms: float = knob(
+        0.0, 0.0, 60000.0, 'for the solver: often missed, mode steps down; 0 = none [ms]'
+    )
     camera: str = free(
         '', f'instead of camera_info: path of a camera.json, or {", ".join(PRESETS)}'
     )

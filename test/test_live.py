@@ -3,6 +3,7 @@
 import threading
 from types import SimpleNamespace
 
+from depth_deblur_ros.core.evidence import template_table
 from depth_deblur_ros.live import compile_kernels, InfoHistory, Intake, Mailbox, OVERTAKEN, Worker
 from hypothesis import given
 from hypothesis import strategies as st
@@ -174,5 +175,7 @@ def test_the_slop_may_change_on_the_way():
     assert intake.pairs == 1
 
 
-def test_preparing_the_solver_solves_something():
+def test_preparing_the_solver_leaves_nothing_to_make_once():
+    template_table.cache_clear()
     compile_kernels()
+    assert template_table.cache_info().currsize == 1

@@ -40,6 +40,7 @@ class Solver:
     def __init__(self):
         self.go, self.busy, self.modes = threading.Event(), threading.Event(), []
         self.go.set()
+        self.outcome = Outcome.SHARP
 
     def __call__(self, frame, params):
         self.modes.append(params.mode)
@@ -47,7 +48,7 @@ class Solver:
         assert self.go.wait(5)
         still = Motion(np.zeros(3), np.zeros(3))
         depth = frame.depth
-        return DeblurResult(frame.image, depth, still, Outcome.SHARP, True, 1.0, 0.0, 0.1)
+        return DeblurResult(frame.image, depth, still, self.outcome, True, 1.0, 0.0, 0.1)
 
 
 @pytest.fixture
@@ -101,6 +102,20 @@ def test_settings_count_from_the_next_frame_on(line):
     send(line, 3)
     until(lambda: len(line.outlet.published) == 3)
     assert line.solver.modes == ['full', 'fast', 'motion']
+
+
+def test_a_missed_deadline_steps_the_mode_down(line):
+    line.solver.outcome = Outcome.SOLVED
+    line.use(settings_from({'deadline_ms': 50.0}))  # it says that it takes 100
+    for stamp in range(1, 8):
+        send(line, stamp)
+        until(lambda stamp=stamp: len(line.outlet.published) == stamp)
+    assert line.solver.modes == ['full'] * 3 + ['fast'] * 3 + ['motion']
+    assert (values(line)['mode'], values(line)['mode in use']) == ('full', 'motion')
+    line.use(settings_from({'deadline_ms': 0.0}))
+    send(line, 8)
+    until(lambda: len(line.outlet.published) == 8)
+    assert line.solver.modes[-1] == 'full'
 
 
 def test_what_is_being_solved_when_all_is_cleared_does_not_go_out(line):
