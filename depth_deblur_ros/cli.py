@@ -9,7 +9,7 @@ What is slow to load is imported by the command that needs it, so that --help is
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 import sys
 from typing import NoReturn
@@ -63,12 +63,14 @@ def _parser() -> argparse.ArgumentParser:
     image.add_argument(
         '--energy', type=Path, metavar='FILE.svg', help='energy of each turn, of the method paper'
     )
+    image.add_argument('--report', type=Path, metavar='FILE.html', help='page of pictures')
     _bench_flags(command('bench', _bench, 'folders of images, scored where the truth is known'))
     _import_flags(
         command('import-tum', _import_tum, 'a TUM-format folder into a rosbag2 mcap bag')
     )
     _sequence_flags(command('sequence', _sequence, 'the sharp frames hidden in one exposure'))
     _replay_flags(command('replay', _replay, 'a bag: every pair solved, results in another bag'))
+    _report_flags(command('report', _report, 'a replayed bag: one HTML page, pictures and plots'))
     return parser
 
 
@@ -84,6 +86,8 @@ def _image(args: argparse.Namespace) -> int:
     from depth_deblur_ros.charts import energy_chart
     from depth_deblur_ros.core.solver import deblur
     from depth_deblur_ros.folders import read_frame, write_image, write_json, write_text
+    from depth_deblur_ros.notes import note_of, Run, shot_of
+    from depth_deblur_ros.page import run_page
     from depth_deblur_ros.results import motion_record
 
     params = solver_params(args)
@@ -95,6 +99,10 @@ def _image(args: argparse.Namespace) -> int:
     write_json(args.out / 'motion.json', motion_record(result, frame.stamp_ns, frame.exposure))
     if args.energy:
         write_text(args.energy, energy_chart(result.energies))
+    if args.report:
+        note = note_of(frame.stamp_ns, frame.exposure, result)
+        run = Run(args.rgb.parent.resolve().name, [note], [shot_of(frame, result)])
+        write_text(args.report, run_page(run))
     print(
         f'{result.outcome.value}: blur {result.blur_px:.1f} px, quality {result.quality:.2f}, '
         f'{result.seconds:.1f} s; {args.out}/deblurred.png, {args.out}/motion.json'
@@ -176,15 +184,9 @@ def _replay_flags(parser: Parser) -> None:
     parser.add_argument('out', type=Path, help='bag to write')
     parser.add_argument('--estimates', type=Path, metavar='FILE', help='one line of JSON per pair')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='one picture per frame')
-    parser.add_argument('--camera', type=Path, help='camera.json instead of the camera_info topic')
+    parser.add_argument('--report', action='store_true', help='one page of the run: OUT.html')
+    _source_flags(parser)
     parser.add_argument('--exposure-s', type=float, metavar='S', help='exposure of every frame')
-    parser.add_argument(
-        '--topics',
-        nargs='+',
-        type=topic,
-        metavar='NAME=TOPIC',
-        help='for colour, depth, info, exposure (default: the usual names, else the only fit)',
-    )
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='skip S seconds')
     parser.add_argument('--duration', type=float, metavar='S', help='stop after S seconds')
     parser.add_argument('--all-topics', action='store_true', help='copy the other topics too')
@@ -193,6 +195,17 @@ def _replay_flags(parser: Parser) -> None:
         '--resume', action='store_true', help='go on where a run of the same kind was killed'
     )
     solver_flags(parser)
+
+
+def _source_flags(parser: Parser) -> None:
+    parser.add_argument('--camera', type=Path, help='camera.json instead of the camera_info topic')
+    parser.add_argument(
+        '--topics',
+        nargs='+',
+        type=topic,
+        metavar='NAME=TOPIC',
+        help='for colour, depth, info, exposure (default: the usual names, else the only fit)',
+    )
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -220,7 +233,46 @@ def _replay(args: argparse.Namespace) -> int:
             resume=args.resume,
         )
     print(f'{args.out}: {summary}')
+    if args.report:
+        _write_report(args, _page_of(args.out), summary.dropped)
     return DONE if summary.complete else SOME_FAILED
+
+
+def _report_flags(parser: Parser) -> None:
+    parser.add_argument('bag', type=Path, help='bag that was replayed')
+    parser.add_argument('out', type=Path, help='bag of the results')
+    parser.add_argument('-o', '--page', type=Path, metavar='FILE', help='default: OUT.html')
+    parser.add_argument('--estimates', type=Path, metavar='FILE', help='of replay: adds energies')
+    _source_flags(parser)
+
+
+def _report(args: argparse.Namespace) -> int:
+    _write_report(args, args.page or _page_of(args.out))
+    return DONE
+
+
+def _page_of(bag: Path) -> Path:
+    whole = bag.resolve()
+    return whole.with_name(f'{whole.name}.html')
+
+
+def _write_report(
+    args: argparse.Namespace, page: Path, lost: Mapping[str, int] | None = None
+) -> None:
+    from depth_deblur_ros.folders import read_camera, write_text
+    from depth_deblur_ros.page import run_page
+    from depth_deblur_ros.review import review
+
+    run = review(
+        args.bag,
+        args.out,
+        camera=read_camera(args.camera).intrinsics if args.camera else None,
+        topics=dict(args.topics or ()),
+        estimates=args.estimates,
+        lost=lost,
+    )
+    write_text(page, run_page(run))
+    print(f'{page}: {len(run.notes)} frames, pictures of {len(run.shots)}')
 
 
 def _progress(bar: tqdm[NoReturn]) -> Callable[[int, int | None], None]:

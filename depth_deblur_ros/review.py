@@ -44,12 +44,15 @@ def review(
     camera: CameraIntrinsics | None = None,
     topics: Mapping[str, str] | None = None,
     estimates: Path | None = None,
+    lost: Mapping[str, int] | None = None,
     slop_s: float = 0.02,
 ) -> Run:
     """
     Read what a replay of `bag` left in `out`.
 
-    camera and topics as replay takes them; estimates, its file of that name, adds the energies.
+    camera and topics as replay takes them; estimates, its file of that name, adds the energies;
+    lost counts the colour frames without a pair, as replay does (default: those between the first
+    result and the last).
     """
     with BagReader(out) as results:
         notes = _notes(results)
@@ -69,7 +72,9 @@ def review(
                 image, depth = images.pop(pair.log_ns)
                 shots.append(shot_of(frame, _result(chosen[pair.log_ns], image, depth)))
         truth = _true_twists(source, ordered)
-    return Run(Path(bag).name, ordered, shots, truth, dict(pairs.dropped))
+    return Run(
+        Path(bag).name, ordered, shots, truth, dict(pairs.dropped if lost is None else lost)
+    )
 
 
 def _notes(results: BagReader) -> dict[int, Note]:
