@@ -23,7 +23,13 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         (
             f'share/{NAME}/config',
-            ['config/deblur.yaml', 'config/fastdds.xml', 'config/paper.yaml'],
+            [
+                'config/deblur.yaml',
+                'config/fastdds.xml',
+                'config/foxglove.json',
+                'config/paper.yaml',
+                'config/view.rviz',
+            ],
         ),
         (f'share/{NAME}/config/presets', sorted(glob('config/presets/*.yaml'))),
     ],
