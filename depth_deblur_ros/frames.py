@@ -6,7 +6,6 @@ Images with distortion are undistorted first; the frame's camera is then one wit
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 import traceback
@@ -30,9 +29,8 @@ from depth_deblur_ros.messages import (
     stamp_ns,
 )
 from depth_deblur_ros.results import refused_result, result_messages
+from depth_deblur_ros.tracking import Tracker
 import numpy as np
-
-Solver = Callable[[RgbdFrame, SolverParams], DeblurResult]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +64,8 @@ class SolvedPair:
     """
     A pair with its result.
 
-    reason says why the solver did not take it, trace where it broke down, frame what it took.
+    reason says why the solver did not take it, trace where it broke down; frame is what it took,
+    with the exposure, told or tracked; doubt is that exposure's relative standard deviation.
     """
 
     pair: Pair
@@ -74,6 +73,7 @@ class SolvedPair:
     result: DeblurResult
     reason: str = ''
     trace: str = ''
+    doubt: float = 0.0
 
     def messages(self) -> list[tuple[str, Fields]]:
         """Give topic and fields of the messages about this pair, with its colour's header."""
@@ -81,28 +81,51 @@ class SolvedPair:
         header = header_fields(stamp_ns(source), source.frame_id)
         camera = self.frame.camera if self.frame else None
         exposure = self.frame.exposure if self.frame else None
-        return list(result_messages(self.result, camera, exposure, header, self.reason))
+        found = result_messages(
+            self.result, camera, exposure, header, self.reason, doubt=self.doubt
+        )
+        return list(found)
 
 
-def solve_pair(pair: Pair, given: Given, params: SolverParams, solve: Solver) -> SolvedPair:
-    """Solve one pair; what cannot be solved is failed, with the reason and its image as it was."""
+def solve_pair(
+    pair: Pair, given: Given, params: SolverParams, tracker: Tracker, following: Pair | None = None
+) -> SolvedPair:
+    """
+    Solve one pair; what cannot be solved is failed, with the reason and its image as it was.
+
+    following: the next pair, where it is there already.
+    """
     frame = None
     try:
         frame = frame_from_pair(pair, given)
-        return SolvedPair(pair, frame, solve(frame, params))
+        tracked = tracker.follow(frame, params, _frame_if_any(following, given))
+        exposure = tracked.exposure
+        if exposure is None:
+            return SolvedPair(pair, frame, tracked.result)
+        frame = replace(frame, exposure=exposure.seconds)
+        return SolvedPair(pair, frame, tracked.result, doubt=exposure.doubt)
     except InputError as error:
         image, depth = (frame.image, frame.depth) if frame else (_image(pair.colour), None)
         return SolvedPair(pair, frame, refused_result(image, depth), str(error))
 
 
-def solve_anyhow(pair: Pair, given: Given, params: SolverParams, solve: Solver) -> SolvedPair:
+def solve_anyhow(
+    pair: Pair, given: Given, params: SolverParams, tracker: Tracker, following: Pair | None = None
+) -> SolvedPair:
     """Solve one pair as solve_pair does; a solver that breaks down has failed, too."""
     try:
-        return solve_pair(pair, given, params, solve)
+        return solve_pair(pair, given, params, tracker, following)
     except Exception as error:
         reason = f'the solver broke down: {type(error).__name__}: {error}'
         result = refused_result(_image(pair.colour), None)
         return SolvedPair(pair, None, result, reason, traceback.format_exc())
+
+
+def _frame_if_any(pair: Pair | None, given: Given) -> RgbdFrame | None:
+    try:
+        return frame_from_pair(pair, given) if pair else None
+    except InputError:
+        return None
 
 
 def frame_from_pair(pair: Pair, given: Given | None = None) -> RgbdFrame:

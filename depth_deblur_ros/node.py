@@ -18,13 +18,14 @@ from typing import Any
 
 from depth_deblur_ros.core.data import InputError
 from depth_deblur_ros.core.solver import deblur
-from depth_deblur_ros.frames import SolvedPair, Solver
+from depth_deblur_ros.frames import SolvedPair
 from depth_deblur_ros.health import OK, Said, Stream
 from depth_deblur_ros.live import compile_kernels, end_work, keep_freed_memory
 from depth_deblur_ros.messages import compressed_fields, Fields, filled, stamp_ns
 from depth_deblur_ros.pipeline import Pipeline
 from depth_deblur_ros.results import DEPTH, IMAGE, TYPES
 from depth_deblur_ros.settings import DECLARED, READ_ONLY, Settings, settings_from
+from depth_deblur_ros.tracking import Solver
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped
 from rcl_interfaces.msg import (
@@ -191,10 +192,13 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
     def _subscribe(self) -> None:
         assert self._pipeline
         self._pipeline.begin()
-        for role, source in self._settings.sources().items():
+        sources, streams = self._settings.sources(), {}
+        for role, source in sources.items():
             name = self.resolve_topic_name(source.topic) + source.suffix
-            stream = self._pipeline.stream(role, name, source.needed)
-            self._inputs.append(self._listen(role, stream, _CLASSES[source.kind]))
+            streams[role] = self._pipeline.stream(role, name, source.needed)
+        for role in reversed(sources):  # of what waits, the first made is taken first: not images
+            kind = _CLASSES[sources[role].kind]
+            self._inputs.append(self._listen(role, streams[role], kind))
 
     def _listen(self, role: str, stream: Stream, kind: Any) -> Any:
         def mismatch(event: Any) -> None:
@@ -216,7 +220,7 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
     def _take(self, role: str, stream: Stream, msg: Any, info: dict[str, Any]) -> None:
         stream.follow(info.get('publication_sequence_number'))
         if self._pipeline:
-            self._pipeline.take(role, msg)
+            self._pipeline.take(role, msg, info.get('received_timestamp'))
             if self._pipeline.undecided and self._slop_timer.is_canceled():
                 slop_s = self._settings.node.sync_slop_s
                 self._slop_timer.timer_period_ns = max(1_000_000, round(slop_s * 1e9))

@@ -14,12 +14,13 @@ import time
 from typing import Any, Protocol
 
 from depth_deblur_ros.core.data import check_exposure, InputError
-from depth_deblur_ros.frames import Pair, solve_anyhow, SolvedPair, Solver
+from depth_deblur_ros.frames import Pair, solve_anyhow, SolvedPair
 from depth_deblur_ros.health import Health, Stream
 from depth_deblur_ros.live import Intake, Worker
 from depth_deblur_ros.messages import Fields, stamp_ns
 from depth_deblur_ros.pace import Pace
 from depth_deblur_ros.settings import Settings
+from depth_deblur_ros.tracking import Solver, Tracker
 
 
 class Outlet(Protocol):
@@ -42,7 +43,7 @@ class Pipeline:
         self, settings: Settings, outlet: Outlet, solve: Solver, first: Callable[[], None]
     ) -> None:
         self._settings = settings
-        self._outlet, self._solver = outlet, solve
+        self._outlet, self._tracker = outlet, Tracker(solve)
         self._gate, self._sending = threading.Lock(), threading.Lock()
         self._intake = Intake(settings.node.sync_slop_s)
         self._health = Health(self._intake)
@@ -66,17 +67,18 @@ class Pipeline:
         """Give what is counted of the messages of a role, now from this topic."""
         return self._health.stream(role, topic, needed)
 
-    def take(self, role: str, msg: Any) -> None:
-        """Take a message in."""
+    def take(self, role: str, msg: Any, came_ns: int | None = None) -> None:
+        """Take a message in that came at this time since 1970 [ns]; None: now."""
+        came_ns = came_ns or time.time_ns()
         with self._gate:
             if role == 'colour':
-                self._intake.push_colour(msg, time.monotonic_ns())
+                self._intake.push_colour(msg, came_ns)
             elif role == 'depth':
                 self._intake.push_depth(msg)
             elif role == 'camera_info':
                 self._intake.infos.push(msg)
             else:
-                self._take_exposure(float(msg.data))
+                self._take_exposure(float(msg.data), came_ns)
             self._health.arrived(role, time.monotonic())
 
     def count_publishers(self, count: Callable[[str], int]) -> None:
@@ -88,7 +90,7 @@ class Pipeline:
         """Pair what has waited long enough with the depth there is; give whether any waits."""
         with self._gate:
             slop_ns = round(self._settings.node.sync_slop_s * 1e9)
-            self._intake.settle(time.monotonic_ns() - slop_ns)
+            self._intake.settle(time.time_ns() - slop_ns)
             return self._intake.undecided
 
     @property
@@ -115,13 +117,14 @@ class Pipeline:
         told = [{'key': key, 'value': str(value)} for key, value in self._pace.values().items()]
         return {**fields, 'values': [*told, *fields['values']]}
 
-    def _take_exposure(self, exposure: float) -> None:
-        self._intake.exposure = None
+    def _take_exposure(self, exposure: float, came_ns: int) -> None:
+        known: float | None = exposure
         try:
             check_exposure(exposure)
-            self._intake.exposure = exposure
         except InputError as error:
+            known = None
             self._outlet.warn(str(error))
+        self._intake.push_exposure(known, came_ns)
 
     def _prepare(self) -> None:
         try:
@@ -150,7 +153,7 @@ class Pipeline:
         mode = pace.mode if self._outlet.wants_pictures() else 'motion'
         params = replace(settings.solver, mode=mode)
         pair = replace(pair, info=self._intake.infos.at(stamp_ns(pair.colour.header)))
-        solved = solve_anyhow(pair, settings.given, params, self._solver)
+        solved = solve_anyhow(pair, settings.given, params, self._tracker)
         pace.note(mode, solved.result)
         if solved.reason:
             self._outlet.warn(solved.trace or solved.reason)

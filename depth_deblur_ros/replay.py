@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 import json
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from depth_deblur_ros.bag import BagReader, BagWriter
 from depth_deblur_ros.core.data import (
@@ -23,12 +23,13 @@ from depth_deblur_ros.core.data import (
 )
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur
-from depth_deblur_ros.frames import Given, Pair, solve_anyhow, Solver
+from depth_deblur_ros.frames import Given, Pair, solve_anyhow
 from depth_deblur_ros.journal import checksum, Done, Journal
 from depth_deblur_ros.mcap_file import BagMessage
 from depth_deblur_ros.messages import stamp_ns
 from depth_deblur_ros.recording import choose_topics, PairReader, Topics
 from depth_deblur_ros.results import motion_record, TYPES
+from depth_deblur_ros.tracking import Solver, Tracker
 
 MAX_DURATION_S = 1e9
 
@@ -62,17 +63,6 @@ class ReplaySummary:
         for title, reasons in (('failed', self.refused), ('dropped', self.dropped)):
             lines += [f'{title} {count}: {reason}' for reason, count in reasons.most_common()]
         return '\n'.join([*lines, *(f'damaged: {note}' for note in self.damage)])
-
-
-@runtime_checkable
-class Memory(Protocol):
-    """A solver that remembers something from frame to frame: what it needs to go on."""
-
-    def state(self) -> Any:
-        """Give all that is remembered, as something that can be pickled."""
-
-    def restore(self, state: Any) -> None:
-        """Remember this, and nothing else."""
 
 
 def replay(
@@ -126,9 +116,9 @@ def replay(
             copy = _copier(writer) if all_topics else None
             pairs = PairReader(reader, names, round(sync_slop_s * 1e9), copy)
             summary = ReplaySummary(dropped=pairs.dropped)
-            work = _Work(writer, journal, solve, params, given, on_frame)
-            for pair in pairs.pairs(*span):
-                done = work.finish(pair)
+            work = _Work(writer, journal, Tracker(solve), params, given, on_frame)
+            for pair, following in _with_next(pairs.pairs(*span)):
+                done = work.finish(pair, following)
                 summary.count(done.record['outcome'], done.reason)
                 if progress:
                     progress(summary.pairs + summary.dropped.total(), total)
@@ -168,15 +158,14 @@ class _Work:
 
     writer: BagWriter
     journal: Journal
-    solve: Solver
+    tracker: Tracker
     params: SolverParams
     given: Given
     on_frame: Callable[[int, RgbdFrame, DeblurResult], None] | None
     _drawn: int = 0
 
-    def finish(self, pair: Pair) -> Done:
+    def finish(self, pair: Pair, following: Pair | None) -> Done:
         """Do one pair, so that it need not be done again."""
-        memory = self.solve if isinstance(self.solve, Memory) else None
         found = self.journal.done_before()
         if found:
             done, messages = found
@@ -184,16 +173,16 @@ class _Work:
                 topic = message.topic
                 self.writer.write_bytes(topic.name, topic.type, message.data, pair.log_ns)
         else:
-            if memory and self.journal.count == self.journal.earlier > 0:
-                memory.restore(self.journal.state)
-            done = self._solved(pair)
+            if self.journal.count == self.journal.earlier > 0:
+                self.tracker.restore(self.journal.state)
+            done = self._solved(pair, following)
         self._drawn += done.drawn
         self.writer.flush()
-        self.journal.add(done, memory.state() if memory and not found else None)
+        self.journal.add(done, None if found else self.tracker.state())
         return done
 
-    def _solved(self, pair: Pair) -> Done:
-        solved = solve_anyhow(pair, self.given, self.params, self.solve)
+    def _solved(self, pair: Pair, following: Pair | None) -> Done:
+        solved = solve_anyhow(pair, self.given, self.params, self.tracker, following)
         sent = [
             self.writer.write(f'/{topic}', TYPES[topic], fields, pair.log_ns)
             for topic, fields in solved.messages()
@@ -204,6 +193,15 @@ class _Work:
         record = motion_record(solved.result, stamp_ns(pair.colour.header), exposure)
         drawn = solved.frame is not None and not solved.reason
         return Done(record, solved.reason, drawn, checksum(sent))
+
+
+def _with_next(pairs: Iterator[Pair]) -> Iterator[tuple[Pair, Pair | None]]:
+    """Give each pair with the one that follows it."""
+    pair = next(pairs, None)
+    while pair is not None:
+        following = next(pairs, None)
+        yield pair, following
+        pair = following
 
 
 def _facts(reader: BagReader, params: SolverParams, given: Given) -> dict[str, Any]:

@@ -51,12 +51,14 @@ def result_messages(
     exposure: float | None,
     header: Fields,
     reason: str = '',
+    *,
+    doubt: float = 0.0,
 ) -> Iterator[tuple[str, Fields]]:
     """
     Give topic and fields of every message that may be sent about a frame.
 
     reason says why a frame could not be solved at all; of its image, depth and camera, only those
-    that could be read are sent.
+    that could be read are sent. doubt is the relative standard deviation of the exposure.
     """
     motion = result.motion
     if result.image.size:
@@ -68,7 +70,7 @@ def result_messages(
     if exposure is not None:
         if result.sign_resolved and result.outcome is not Outcome.FAILED:
             yield MOTION, _twist_stamped(motion, exposure, header)
-        yield MOTION_WITH_COVARIANCE, _twist_with_covariance(result, exposure, header)
+        yield MOTION_WITH_COVARIANCE, _twist_with_covariance(result, exposure, header, doubt)
     yield DISPLACEMENT, _twist_stamped(motion, 1.0, header)
     yield RESULT, _status(result, exposure, header, reason)
 
@@ -113,26 +115,32 @@ def motion_record(result: DeblurResult, stamp_ns: int, exposure: float | None) -
     return record
 
 
-def twist_covariance(result: DeblurResult, exposure: float) -> npt.NDArray[np.float64]:
+def twist_covariance(
+    result: DeblurResult, exposure: float, doubt: float = 0.0
+) -> npt.NDArray[np.float64]:
     """
     Give the (6, 6) covariance of the camera's velocity, in the order linear, angular.
 
-    Where the sign is open, the mean is zero and p p' + P is the second moment about it.
+    Where the sign is open, the mean is zero and p p' + P is the second moment about it. The
+    exposure's relative standard deviation, doubt, adds doubt^2 p p'.
     """
     if result.outcome is Outcome.FAILED:
         return UNKNOWN_VARIANCE * np.eye(6)
-    p, spread = result.motion.vector, result.motion.covariance
+    p = result.motion.vector
+    spread = result.motion.covariance + doubt**2 * np.outer(p, p)
     if not result.sign_resolved:
         spread = spread + np.outer(p, p)
     swapped = spread[np.ix_(_LINEAR_FIRST, _LINEAR_FIRST)] / exposure**2
     return (swapped + swapped.T) / 2
 
 
-def _twist_with_covariance(result: DeblurResult, exposure: float, header: Fields) -> Fields:
+def _twist_with_covariance(
+    result: DeblurResult, exposure: float, header: Fields, doubt: float
+) -> Fields:
     zero = np.zeros(3)
     known = result.sign_resolved and result.outcome is not Outcome.FAILED
     motion = result.motion if known else Motion(zero, zero)
-    covariance = twist_covariance(result, exposure).ravel().tolist()
+    covariance = twist_covariance(result, exposure, doubt).ravel().tolist()
     twist = {'twist': _twist(motion, exposure), 'covariance': covariance}
     return {'header': header, 'twist': twist}
 

@@ -9,6 +9,7 @@ from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.frames import frame_from_pair, Given, Pair, solve_anyhow, undistorted
 from depth_deblur_ros.messages import camera_info_fields, depth_fields, header_fields, image_fields
 from depth_deblur_ros.results import CAMERA_INFO, IMAGE, RESULT
+from depth_deblur_ros.tracking import Tracker
 import numpy as np
 import pytest
 
@@ -94,7 +95,7 @@ def test_a_solver_that_breaks_down_lets_the_image_pass():
     def solve(frame, params):
         raise MemoryError('no more')
 
-    solved = solve_anyhow(pair_of(info_of(CAMERA)), Given(), SolverParams(), solve)
+    solved = solve_anyhow(pair_of(info_of(CAMERA)), Given(), SolverParams(), Tracker(solve))
     assert solved.result.outcome is Outcome.FAILED
     assert solved.reason == 'the solver broke down: MemoryError: no more'
     assert 'Traceback' in solved.trace
@@ -106,7 +107,7 @@ def test_a_solver_that_breaks_down_lets_the_image_pass():
 
 def test_a_frame_that_is_refused_says_what_could_be_read():
     pair = pair_of(info_of(CAMERA), depth=np.ones((24, 32), np.float32))
-    solved = solve_anyhow(pair, Given(), SolverParams(), None)
+    solved = solve_anyhow(pair, Given(), SolverParams(), Tracker())
     messages = dict(solved.messages())
     assert IMAGE in messages and CAMERA_INFO not in messages
     assert solved.reason.startswith('depth is 32x24 but the image is 320x240')

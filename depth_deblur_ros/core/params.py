@@ -35,6 +35,11 @@ class SolverParams:
     mode: str = choice(
         'full', MODES, 'full: best image; fast: fewer image steps; motion: no image step'
     )
+    neighbours: str = choice(
+        'heed',
+        ('heed', 'ignore'),
+        'heed: the frames around one tell its sign and exposure; ignore: each frame alone',
+    )
     threads: int = knob(2, 1, 256, 'threads of the compiled kernels')
     prior: float = knob(2.7, 0.01, 100.0, 'weight of the image prior: more is smoother [c]')
     reweightings: int = knob(3, 1, 20, 'quadratic problems that the image step solves')

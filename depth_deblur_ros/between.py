@@ -1,0 +1,134 @@
+"""
+The camera's motion from one frame to the next, from points that are tracked between them.
+
+Points are followed by pyramidal Lucas-Kanade both ways, and the motion is fitted to their flow at
+the depth midway, docs/method.md (40) to (42). Blur does no harm as long as both frames have much
+the same: what is tracked is the middle of the exposure.
+[B00] Bouguet, Pyramidal implementation of the Lucas Kanade feature tracker, Intel, 2000.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, RgbdFrame, Vector
+from depth_deblur_ros.core.geometry import interaction_matrix
+import numpy as np
+import numpy.typing as npt
+
+WIDTH = 400  # px; wider images are halved until they are no wider
+CORNERS, QUALITY, APART = 400, 0.005, 6  # of goodFeaturesToTrack; the last in px
+WINDOW, LEVELS = (21, 21), 4
+THERE_AND_BACK = 0.7  # px; a track that does not come back is none
+SAME_SURFACE = 0.15  # relative depth between both ends of a track
+ROUNDS = 12
+FINEST = 0.2  # px; no track is better than this
+CUT = 4.0  # standard deviations; what is farther off does not count
+FEWEST, LEAST_SHARE = 20, 0.4  # of the tracks must agree
+OPTIMISM = 18.0  # errors of neighbouring tracks are alike, and those of depth stay: times variance
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One frame as it is tracked: grey (H, W) 8 bit, depth (H, W) [m] with NaN, its camera."""
+
+    grey: npt.NDArray[np.uint8]
+    depth: FloatImage
+    camera: CameraIntrinsics
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """The motion (6,) over the time between two frames, as Motion tells it, and (6, 6)."""
+
+    motion: Vector
+    covariance: Vector
+
+
+def view_of(frame: RgbdFrame) -> View:
+    """Give a frame as it is tracked, small, at even brightness and contrast."""
+    factor = 1
+    while frame.camera.width // factor > WIDTH:
+        factor *= 2
+    width, height = frame.camera.width // factor, frame.camera.height // factor
+    grey = frame.image if frame.image.ndim == 2 else frame.image.mean(2)
+    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    even = 110 + 50 * (small - small.mean()) / max(float(small.std()), 1 / 255)
+    depth = cv2.resize(frame.depth, (width, height), interpolation=cv2.INTER_NEAREST)
+    return View(
+        np.asarray(np.clip(even, 0, 255), np.uint8),
+        np.asarray(depth, np.float32),
+        frame.camera.scaled(width, height),
+    )
+
+
+def motion_between(first: View, second: View) -> Between | None:
+    """Find the motion from first to second; None where too few tracks agree."""
+    if first.camera != second.camera:
+        return None
+    start, end = _tracks(first.grey, second.grey)
+    near, far = _depth_at(first.depth, start), _depth_at(second.depth, end)
+    one = np.isnan(near) | np.isnan(far)
+    depth = np.where(one, np.where(np.isnan(near), far, near), (near + far) / 2)
+    same = one | (np.abs(near - far) < SAME_SURFACE * depth)
+    good = same & (depth > 0)
+    middle, flow = ((start + end) / 2)[good], (end - start)[good]
+    if len(flow) < FEWEST:
+        return None
+    j = interaction_matrix(middle[:, 0], middle[:, 1], depth[good], first.camera)
+    return _fit(j, flow)
+
+
+def _tracks(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[Vector, Vector]:
+    """Give where tracks start and end, (n, 2) [px] each, in two images [B00]."""
+    none = np.zeros((0, 2))
+    found_corners = cv2.goodFeaturesToTrack(first, CORNERS, QUALITY, APART, blockSize=7)
+    if found_corners is None:
+        return none, none
+    corners = np.asarray(found_corners)
+    there, found = _followed(first, second, corners)
+    back, found_back = _followed(second, first, there)
+    miss = np.linalg.norm((back - corners)[:, 0], axis=1)
+    good = found & found_back & (miss < THERE_AND_BACK)
+    return corners[good, 0].astype(np.float64), there[good, 0].astype(np.float64)
+
+
+def _followed(
+    first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8], points: npt.NDArray[Any]
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    """Give where points (n, 1, 2) of the first image are in the second, and which are found."""
+    where = np.zeros_like(points)
+    where, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, points, where, winSize=WINDOW, maxLevel=LEVELS
+    )
+    return np.asarray(where), np.asarray(found)[:, 0] > 0
+
+
+def _depth_at(depth: FloatImage, points: Vector) -> Vector:
+    """Give the depth (n,) at points (n, 2) [px]; NaN outside."""
+    x, y = np.rint(points).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+    found = np.full(len(points), np.nan)
+    found[inside] = depth[y[inside], x[inside]]
+    return found
+
+
+def _fit(j: Vector, flow: Vector) -> Between | None:
+    """Fit a motion (6,) to flow (n, 2) = J p by reweighted least squares, (41), (42)."""
+    weight = np.ones(len(flow))
+    spread, ridge = FINEST, 1e-9 * np.eye(6)
+    for _ in range(ROUNDS):
+        weighted = weight[:, None, None] * j
+        information = np.einsum('nij,nik->jk', weighted, j)
+        if weight.sum() < 6:
+            return None
+        p = np.linalg.solve(information + ridge, np.einsum('nij,ni->j', weighted, flow))
+        miss = np.linalg.norm(flow - j @ p, axis=1)
+        spread = max(FINEST, 1.25 * float(np.median(miss)))
+        weight = np.square(np.clip(1 - np.square(miss / (CUT * spread)), 0, None))
+    agree = weight > 0
+    if agree.sum() < FEWEST or agree.mean() < LEAST_SHARE:
+        return None
+    return Between(p, OPTIMISM * spread**2 * np.linalg.inv(information + ridge))

@@ -1,0 +1,151 @@
+"""
+One frame's blur beside what its neighbours say: sign, exposure, and the motion of both together.
+
+Notation: p (6,) motion over the exposure from the blur, C its covariance; u (6,) velocity from the
+neighbours, P its covariance; T the exposure. docs/method.md (47) to (53).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+from depth_deblur_ros.core.data import CameraIntrinsics, DeblurResult, Motion, Outcome, Vector
+from depth_deblur_ros.core.evidence import motion_axes
+from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.glide import Glide
+from depth_deblur_ros.shutter import agree, Exposure, Shutter
+import numpy as np
+
+SURE = 8.0  # log-odds at which the sign is told
+CLEAR = 16.0  # squared distance from zero at which neighbours may claim a motion
+TINY = 1e-12
+ODD = 40.0  # squared distance in 5 dimensions beyond which p and u do not belong together
+GUESS = 0.5  # exposures per frame interval, before any is known
+LONGEST = 1.15  # exposures per frame interval that are possible
+REAL = 2.0  # times the solver's covariance: lenses, shutters and paths are not ideal
+FLOOR_PX = 0.3  # px; standard deviation of p along each of its axes that stays
+INEXACT_PX = 0.4  # px; that of the length of a blur
+TOLD_DOUBT = 0.1  # relative; how exact an exposure is that is told
+VISIBLE_PX = 0.3  # px; least blur that neighbours may claim where the image alone shows none
+SHARP_PX, SHARP_DOUBT = 2.0, 0.4  # px, relative; blur of a picture that looks sharp
+CLAIM_PX = 4.0  # px; most blur that they may claim where the image looks sharp
+VAGUE = 0.6  # doubt of an exposure beyond which nothing can be claimed
+WORD = 0.5  # quality of a motion that only the neighbours tell
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What the neighbours tell: velocity, exposure, frame interval [s], and whether they saw."""
+
+    glide: Glide
+    shutter: Shutter
+    told: Exposure | None
+    interval: float
+    seen: bool
+
+    @property
+    def exposure(self) -> Exposure | None:
+        """Give the exposure as far as it is known."""
+        return self.told or self.shutter.exposure
+
+    def expected(self) -> Motion | None:
+        """Give the motion over the exposure that the neighbours lead to expect."""
+        if not self.seen:
+            return None
+        seconds = self.exposure.seconds if self.exposure else GUESS * self.interval
+        spread = seconds**2 * self.glide.spread
+        return Motion.from_vector(seconds * self.glide.velocity, spread)
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """A frame's result and exposure, and what its blur tells of the shutter and the velocity."""
+
+    result: DeblurResult
+    exposure: Exposure | None
+    shutter: Shutter
+    velocity: tuple[Vector, Vector] | None = None  # (6,) and (6, 6)
+
+
+def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Joined:
+    """Put a frame's result beside its neighbours."""
+    if result.sign_resolved or not context.seen:
+        return Joined(result, context.exposure, context.shutter)
+    if result.outcome is not Outcome.SOLVED:
+        context = _shortened(result, context, camera)
+        return Joined(_claimed(result, context, camera), context.exposure, context.shutter)
+    axes = motion_axes(result.depth, camera)
+    covariance = REAL * result.motion.covariance + FLOOR_PX**2 * axes @ axes.T
+    found = _measured(result.motion.vector, covariance, context)
+    if found is None:
+        return Joined(_claimed(result, context, camera), context.exposure, context.shutter)
+    motion = math.copysign(1, found.seconds) * result.motion.vector
+    doubt = math.hypot(found.doubt, INEXACT_PX / result.blur_px)
+    length = Exposure(abs(found.seconds), doubt)
+    shutter, exposure = context.shutter, context.told
+    if exposure is None:
+        shutter, exposure = shutter.measured(length)
+    elif not agree(replace(exposure, doubt=TOLD_DOUBT), length):
+        return Joined(_signed(result, motion, result.motion.covariance), exposure, shutter)
+    along = np.outer(motion, motion) * exposure.doubt**2
+    velocity = (motion / exposure.seconds, (covariance + along) / exposure.seconds**2)
+    glide = context.glide.measured(*velocity)
+    p, spread = exposure.seconds * glide.velocity, exposure.seconds**2 * glide.spread
+    joined = replace(_signed(result, p, spread), blur_px=blur_length(p, result.depth, camera))
+    return Joined(joined, exposure, shutter, velocity)
+
+
+def _shortened(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Context:
+    """Take it for a short exposure where the image stays sharp in spite of the motion, (52)."""
+    u, exposure = context.glide.velocity, context.exposure
+    longest = exposure.seconds if exposure else context.interval
+    rate = blur_length(u, result.depth, camera)  # px/s
+    sure = float(u @ np.linalg.solve(context.glide.spread, u)) > CLEAR
+    if (
+        context.told
+        or result.outcome is not Outcome.SHARP
+        or not sure
+        or rate * longest < CLAIM_PX
+    ):
+        return context
+    shutter, _ = context.shutter.measured(Exposure(SHARP_PX / rate, SHARP_DOUBT))
+    return replace(context, shutter=shutter)
+
+
+def _measured(p: Vector, covariance: Vector, context: Context) -> Exposure | None:
+    """Give T of p = T u, negative where p is the reverse; None where they do not match, (47)."""
+    u, known = context.glide.velocity, context.exposure
+    seconds = known.seconds if known else GUESS * context.interval
+    weight = np.linalg.inv(covariance + seconds**2 * context.glide.spread)
+    information = float(u @ weight @ u)
+    length = float(p @ weight @ u) / max(information, TINY)
+    miss = p - length * u
+    if float(miss @ weight @ miss) > ODD or abs(length) > LONGEST * context.interval:
+        return None
+    spread = 1 / math.sqrt(max(information, TINY))
+    expected = known.seconds if known and known.doubt < VAGUE else abs(length) / 2
+    if 2 * abs(length) * expected < SURE * spread**2:
+        return None
+    return Exposure(length, spread / abs(length))
+
+
+def _signed(result: DeblurResult, p: Vector, covariance: Vector) -> DeblurResult:
+    return replace(result, motion=Motion.from_vector(p, covariance), sign_resolved=True)
+
+
+def _claimed(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> DeblurResult:
+    """Give a frame that shows no motion by itself the one its neighbours tell, if any, (53)."""
+    exposure = context.exposure
+    if exposure is None or exposure.doubt > VAGUE:
+        return result
+    p = exposure.seconds * context.glide.velocity
+    covariance = exposure.seconds**2 * context.glide.spread
+    blur_px = blur_length(p, result.depth, camera)
+    most = CLAIM_PX if result.outcome is Outcome.SHARP else math.inf
+    sure = float(p @ np.linalg.solve(covariance, p)) > CLEAR
+    if not (sure and VISIBLE_PX <= blur_px <= most):
+        return result
+    covariance = covariance + exposure.doubt**2 * np.outer(p, p)
+    claimed = replace(result, outcome=Outcome.SOLVED, quality=WORD, blur_px=blur_px)
+    return _signed(claimed, p, covariance)
