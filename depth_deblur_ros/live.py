@@ -28,6 +28,7 @@ T = TypeVar('T')
 OVERTAKEN = 'overtaken by a newer pair while the solver was busy'
 KEPT = 30  # frames that may wait for their depth: a second of 30 Hz
 KEPT_INFOS = 30
+KEPT_EXPOSURES = 300
 # glibc's M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_TOP_PAD, bytes: an image's memory stays with the
 # process, so that the next one does not pay for its pages again.
 _SOLVING = threading.Lock()  # numba's plainest thread pool breaks when two threads call it
@@ -154,20 +155,24 @@ class Intake:
     def __init__(self, slop_s: float) -> None:
         self.mailbox: Mailbox[Pair] = Mailbox()
         self.infos = InfoHistory()
-        self.exposure: float | None = None
+        self._exposures: deque[tuple[int, float | None]] = deque(maxlen=KEPT_EXPOSURES)
         self.arrived = self.pairs = 0
         self._dropped: Counter[str] = Counter()
         self._pairer: StampPairer[Pair, Any] = StampPairer(round(slop_s * 1e9), KEPT)
 
-    def push_colour(self, msg: Any, now_ns: int) -> None:
-        """Take a colour message that came now."""
+    def push_colour(self, msg: Any, came_ns: int) -> None:
+        """Take a colour message that came at this time."""
         self.arrived += 1
-        pair = Pair(msg, None, None, self.exposure, now_ns)
+        pair = Pair(msg, None, None, None, came_ns)
         self._offer(self._pairer.push_colour(stamp_ns(msg.header), pair))
 
     def push_depth(self, msg: Any) -> None:
         """Take a depth message."""
         self._offer(self._pairer.push_depth(stamp_ns(msg.header), msg))
+
+    def push_exposure(self, exposure: float | None, came_ns: int) -> None:
+        """Take an exposure time [s] for what comes later; None: unknown from then on."""
+        self._exposures.append((came_ns, exposure))
 
     def settle(self, came_before_ns: int) -> None:
         """Wait no longer for a nearer depth of the colour messages that came before this time."""
@@ -181,7 +186,7 @@ class Intake:
         """Drop all that waits or is being solved, for this reason."""
         self._pairer.clear(reason)
         self.infos.clear()
-        self.exposure = None
+        self._exposures.clear()
         if count := self.mailbox.clear():
             self._dropped[reason] += count
 
@@ -218,7 +223,9 @@ class Intake:
     def _offer(self, found: list[tuple[Pair, Any]]) -> None:
         for colour, depth in found:
             self.pairs += 1
-            if self.mailbox.offer(replace(colour, depth=depth)) is not None:
+            before = (e for came_ns, e in reversed(self._exposures) if came_ns <= colour.log_ns)
+            pair = replace(colour, depth=depth, exposure=next(before, None))
+            if self.mailbox.offer(pair) is not None:
                 self._dropped[OVERTAKEN] += 1
 
 

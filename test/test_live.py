@@ -135,7 +135,7 @@ def test_a_busy_solver_gets_the_newest_pair_whole():
 def test_after_the_slop_an_older_depth_is_good_enough():
     intake = Intake(0.02)
     intake.push_depth(message(100))
-    intake.push_colour(message(110), now_ns=0)
+    intake.push_colour(message(110), came_ns=0)
     assert intake.undecided and intake.pairs == 0
     intake.settle(came_before_ns=-1)
     assert intake.pairs == 0  # the slop has not passed
@@ -146,25 +146,30 @@ def test_after_the_slop_an_older_depth_is_good_enough():
 def test_without_a_depth_near_enough_the_slop_changes_nothing():
     intake = Intake(0.02)
     intake.push_depth(message(50))
-    intake.push_colour(message(110), now_ns=0)
+    intake.push_colour(message(110), came_ns=0)
     intake.settle(came_before_ns=0)
     assert intake.undecided and intake.pairs == 0
     intake.push_depth(message(111))
     assert intake.pairs == 1
-    intake.push_colour(message(143), now_ns=0)
+    intake.push_colour(message(143), came_ns=0)
     intake.push_depth(message(144))
     assert (intake.pairs, intake.unused_depths) == (2, 1)  # the one at 50
 
 
 def test_an_exposure_belongs_to_the_images_after_it():
     intake = Intake(0.02)
-    intake.push_colour(message(0), 0)
-    intake.exposure = 0.01
-    intake.push_depth(message(0))
+    seen = []
+    for number in range(3):
+        intake.push_colour(message(40 * number), came_ns=10 * number)
+        intake.push_exposure(number / 100, came_ns=10 * number - 1)  # comes first, is read later
+        intake.push_exposure(9.0, came_ns=10 * number + 5)
+        intake.push_depth(message(40 * number))
+        seen.append(intake.mailbox.take().exposure)
+    assert seen == [0.0, 0.01, 0.02]
+    intake.clear('told to')
+    intake.push_colour(message(200), came_ns=40)
+    intake.push_depth(message(200))
     assert intake.mailbox.take().exposure is None
-    intake.push_colour(message(40), 0)
-    intake.push_depth(message(40))
-    assert intake.mailbox.take().exposure == 0.01
 
 
 def test_the_slop_may_change_on_the_way():

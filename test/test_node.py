@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 
+from depth_deblur_ros.results import UNKNOWN_VARIANCE
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
@@ -122,6 +123,23 @@ def test_what_is_not_known_is_not_said(peer, start):
     assert variance == pytest.approx((0.03**2 + 1e-8) / 0.01**2, rel=1e-5)
 
 
+def test_each_frame_takes_the_exposure_that_was_sent_just_before_it(peer, start):
+    start('-p', 'prior:=0.5', STUB_SECONDS='0')
+    twists = peer.listen(TwistStamped, 'motion')
+    peer.send('exposure', Float32, Float32(data=1.0))
+    peer.send_frame(START)
+    for number in range(1, 31):
+        peer.send('exposure', Float32, Float32(data=number / 64))
+        peer.send_frame(START + number * 33_000_000, info=False)
+        if number % 3 == 0:  # some wait together
+            peer.spin(0.1)
+    values = peer.settled(arrived=31)
+    assert int(values['published']) == len(twists) > 10
+    for stamp, twist in zip(stamps(twists), twists, strict=True):
+        number = (stamp - START) // 33_000_000
+        assert twist.twist.angular.z == -0.03 / (number / 64 if number else 1.0)
+
+
 def test_a_solver_too_slow_drops_whole_pairs_and_counts_them(peer, start):
     start(STUB_SECONDS='0.3')
     moves = peer.listen(TwistStamped, 'displacement')
@@ -211,6 +229,27 @@ def test_parameters_have_text_and_limits_and_change_for_the_next_frame(peer, sta
 def change_state(peer, transition, node='depth_deblur'):
     request = ChangeState.Request(transition=Transition(id=transition))
     assert peer.call(ChangeState, f'{node}/change_state', request).success
+
+
+def test_a_deadline_that_is_missed_steps_the_mode_down_and_up(peer, start):
+    start('-p', 'deadline_ms:=10.0')  # the stub says that it takes 20
+    images = peer.listen(Image, 'deblurred/image')
+
+    def send(count):
+        for _ in range(count):
+            number = len(images)
+            peer.send_frame(START + number * SECOND)
+            peer.until(lambda number=number: len(images) == number + 1)
+
+    send(8)
+    assert [set(m.data) for m in images] == [{191}] * 6 + [{64}] * 2  # 64: no image step
+    peer.until(lambda: peer.status()[1]['mode in use'] == 'motion')
+    values = peer.status()[1]
+    assert (values['mode'], values['mode stepped down']) == ('full', '2')
+    assert parameters(peer, deadline_ms=100.0) == []  # room for what was asked for
+    send(1)
+    assert set(images[-1].data) == {191}
+    assert 'deadline_ms' in parameters(peer, deadline_ms=-1.0)[0]
 
 
 def test_the_lifecycle_stops_and_frees_the_work(peer, start):
@@ -536,29 +575,66 @@ def test_the_real_solver_at_thirty_frames_a_second(peer, start, tmp_path):
     remaps = [w for old, new in play_bag.REMAP.items() for w in ('-r', f'{old}:={new}')]
     start(*remaps, '-p', 'mode:=motion', command=ros_parts.NODE)
     moves = peer.listen(TwistStamped, 'displacement')
+    twists = peer.listen(TwistStamped, 'motion')
+    spreads = peer.listen(TwistWithCovarianceStamped, 'motion_with_covariance')
     infos = peer.listen(CameraInfo, 'deblurred/camera_info')
     results = peer.listen(DiagnosticStatus, 'result')
     peer.until(lambda: peer.status()[0].startswith('nothing on'), 90)  # the solver is ready
     player = Process(
-        (sys.executable, ros_parts.ROOT / 'scripts/play_bag.py', '--frames', 90), tmp_path / 'sent'
+        (sys.executable, ros_parts.ROOT / 'scripts/play_bag.py', '--frames', 120),
+        tmp_path / 'sent',
     )
     peer.until(lambda: player.process.poll() is not None, 60)
     sent = player.json()['stamps']
-    values = peer.settled(arrived=len(sent), timeout=60)
+    values = peer.settled(timeout=60)
     assert_all_accounted(values)
     for role in ('colour', 'depth', 'camera_info'):
-        assert values[f'{role} lost in transport'] == '0'
-        assert int(values[f'{role} arrived']) == len(sent)
+        # The profile loses nothing; a busy machine may stop the node for longer than its queue.
+        lost = values[f'{role} lost in transport']
+        assert lost == values[f'{role} lost in a full queue']
+        assert int(values[f'{role} arrived']) + int(lost) == len(sent)
+    peer.spin(0.5)
     assert int(values['published']) == len(moves) == len(results) == len(infos) > 0
     assert set(stamps(moves)) <= set(sent)
-    assert stamps(moves) == stamps(infos)
-    assert infos[0].k[0] == 525.0
+    assert stamps(moves) == stamps(infos) == stamps(spreads)
+    assert {m.header.frame_id for m in (*moves, *twists, *spreads, *infos)} == {
+        'camera_rgb_optical_frame'
+    }
+    assert (infos[0].k[0], infos[0].width, infos[0].height) == (525.0, 640, 480)
+    known = dict(zip(stamps(twists), twists, strict=True))
+    for move, spread, result in zip(moves, spreads, results, strict=True):
+        assert_velocities(move, known.pop(stamps([move])[0], None), spread, result)
+    assert not known
     errors = [
         displacement_error(move, true_twist(sent.index(stamp) % 10))
         for move, stamp, result in zip(moves, stamps(moves), results, strict=True)
         if result.message == 'solved'
     ]
     assert errors and np.median(errors) < 0.35
+
+
+EXPOSURE = 0.02  # s, of the sample bag
+
+
+def assert_velocities(move, twist, spread, result):
+    """The velocities are the displacement over the exposure; none is told where it is open."""
+    values = {entry.key: entry.value for entry in result.values}
+    failed = values['outcome'] == 'failed'
+    expected = six(move.twist) / EXPOSURE
+    told = values['sign_resolved'] == 'true' and not failed
+    assert (twist is not None) == told
+    if told:
+        np.testing.assert_allclose(six(twist.twist), expected, rtol=1e-6)
+    mean, covariance = six(spread.twist.twist), np.reshape(spread.twist.covariance, (6, 6))
+    np.testing.assert_allclose(mean, expected if told else 0, rtol=1e-6)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    assert (np.diag(covariance) >= 0.999 * np.square(expected - mean)).all()
+    assert not failed or covariance[0, 0] == UNKNOWN_VARIANCE
+
+
+def six(twist):
+    """Give linear and angular in one vector."""
+    return np.array([getattr(part, x) for part in (twist.linear, twist.angular) for x in 'xyz'])
 
 
 def true_twist(number):
@@ -569,7 +645,7 @@ def true_twist(number):
     with BagReader(play_bag.BAG) as bag:
         messages = list(bag.messages({'/ground_truth/motion'}))
     angular = decoded(messages[number]).twist.angular
-    return 0.02 * np.array([angular.x, angular.y, angular.z])
+    return EXPOSURE * np.array([angular.x, angular.y, angular.z])
 
 
 def displacement_error(move, truth):
