@@ -17,7 +17,7 @@ import numpy as np
 
 MEMORY = 0.1  # s
 RESTLESS = np.array([16.0, 5.0])  # rad/s^2, m/s^2; of a hand that shakes
-CALMEST, WILDEST = RESTLESS / 5, 4 * RESTLESS
+CALMEST, WILDEST = RESTLESS / 2, 4 * RESTLESS
 CALM_DOWN, STIR_UP = 0.1, 0.3  # powers of how far a way missed the expected one
 FAST = np.repeat([3.0, 1.5], 3)  # rad/s, m/s; what a velocity may be before anything is seen
 POINTS = 16  # of the integral for the noise

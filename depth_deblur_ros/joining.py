@@ -21,14 +21,14 @@ SURE = 8.0  # log-odds at which the sign is told
 CLEAR = 16.0  # squared distance from zero at which neighbours may claim a motion
 TINY = 1e-12
 ODD = 40.0  # squared distance in 5 dimensions beyond which p and u do not belong together
-GUESS = 0.5  # exposures per frame interval, before any is known
+GUESS = 0.5  # exposures per frame interval, before any is known; and how doubtful that is
 LONGEST = 1.15  # exposures per frame interval that are possible
 REAL = 2.0  # times the solver's covariance: lenses, shutters and paths are not ideal
 FLOOR_PX = 0.3  # px; standard deviation of p along each of its axes that stays
 INEXACT_PX = 0.4  # px; that of the length of a blur
 TOLD_DOUBT = 0.1  # relative; how exact an exposure is that is told
 VISIBLE_PX = 0.3  # px; least blur that neighbours may claim where the image alone shows none
-SHARP_PX, SHARP_DOUBT = 2.0, 0.4  # px, relative; blur of a picture that looks sharp
+SHARP_PX, SHARP_DOUBT = 2.0, 0.25  # px, relative; blur of a picture that looks sharp
 CLAIM_PX = 4.0  # px; most blur that they may claim where the image looks sharp
 VAGUE = 0.6  # doubt of an exposure beyond which nothing can be claimed
 WORD = 0.5  # quality of a motion that only the neighbours tell
@@ -43,11 +43,12 @@ class Context:
     told: Exposure | None
     interval: float
     seen: bool
+    now: Exposure | None = None  # of this frame alone, where it differs from the shutter's
 
     @property
     def exposure(self) -> Exposure | None:
         """Give the exposure as far as it is known."""
-        return self.told or self.shutter.exposure
+        return self.told or self.now or self.shutter.exposure
 
     def expected(self) -> Motion | None:
         """Give the motion over the exposure that the neighbours lead to expect."""
@@ -99,18 +100,16 @@ def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Jo
 def _shortened(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Context:
     """Take it for a short exposure where the image stays sharp in spite of the motion, (52)."""
     u, exposure = context.glide.velocity, context.exposure
-    longest = exposure.seconds if exposure else context.interval
-    rate = blur_length(u, result.depth, camera)  # px/s
     sure = float(u @ np.linalg.solve(context.glide.spread, u)) > CLEAR
-    if (
-        context.told
-        or result.outcome is not Outcome.SHARP
-        or not sure
-        or rate * longest < CLAIM_PX
-    ):
+    if context.told or not sure or result.outcome is not Outcome.SHARP:
         return context
-    shutter, _ = context.shutter.measured(Exposure(SHARP_PX / rate, SHARP_DOUBT))
-    return replace(context, shutter=shutter)
+    rate = blur_length(u, result.depth, camera)  # px/s
+    longest = exposure.seconds if exposure else context.interval
+    if rate * longest >= CLAIM_PX:
+        now = Exposure(SHARP_PX / rate, SHARP_DOUBT)
+        return replace(context, shutter=context.shutter.measured(now)[0], now=now)
+    guess = Exposure(min(SHARP_PX / rate, GUESS * context.interval), GUESS)
+    return context if exposure else replace(context, now=guess)
 
 
 def _measured(p: Vector, covariance: Vector, context: Context) -> Exposure | None:
