@@ -360,8 +360,15 @@ def test_stamps_apart_and_another_qos_are_told(peer, start):
     assert int(values['unused depths']) > 100
 
 
+def assert_only_overtaken(values, pairs):
+    """All are paired; a busy machine may overtake a few, nothing else is lost."""
+    overtaken = values.get('dropped: overtaken by a newer pair while the solver was busy', '0')
+    assert (values['pairs'], values['dropped']) == (str(pairs), overtaken)
+    assert int(overtaken) < pairs / 4
+
+
 def test_late_depth_still_finds_its_colour(peer, start):
-    start()
+    start(STUB_SECONDS='0')
     moves = peer.listen(TwistStamped, 'displacement')
     peer.send_frame(START)
     sent = [START + (i + 1) * 33_000_000 for i in range(20)]
@@ -373,9 +380,10 @@ def test_late_depth_still_finds_its_colour(peer, start):
     for stamp in sent[-6:]:
         peer.send(DEPTH, Image, depth_message(stamp))
         peer.spin(0.04)
-    values = peer.settled(published=21)
-    assert stamps(moves) == [START, *sent]
-    assert values['dropped'] == '0' and values['unused depths'] == '0'
+    values = peer.settled(arrived=21)
+    assert set(stamps(moves)) <= {START, *sent} and stamps(moves) == sorted(stamps(moves))
+    assert_only_overtaken(values, 21)
+    assert values['unused depths'] == '0'
 
 
 def test_an_older_depth_is_taken_after_the_slop(peer, start):
@@ -388,15 +396,16 @@ def test_an_older_depth_is_taken_after_the_slop(peer, start):
 
 
 def test_a_looped_bag_goes_on(peer, start):
-    start()
+    start(STUB_SECONDS='0')
     moves = peer.listen(TwistStamped, 'displacement')
     sent = [START + i * 100_000_000 for i in range(10)]
     for _ in range(3):
         for stamp in sent:
             peer.send_frame(stamp)
             peer.spin(0.05)
-    peer.settled(published=30)
-    assert stamps(moves) == sent * 3
+    assert_only_overtaken(peer.settled(arrived=30), 30)
+    seen = stamps(moves)
+    assert set(seen) <= set(sent) and sum(np.diff(seen) < 0) == 2
 
 
 def test_ros_time_that_jumps_back_drops_what_waits(peer, start):
