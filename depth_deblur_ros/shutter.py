@@ -14,8 +14,7 @@ import math
 DRIFT = 0.03  # of log exposure, standard deviation from one frame to the next
 FORGET = 0.2  # the same over a gap
 FAR = 3.0  # standard deviations; exposures farther apart differ
-UNEVEN = 0.03  # least standard deviation of one measurement of log exposure
-LIKE = 0.5  # errors of neighbouring frames are alike: least doubt of a mean over that of its best
+UNEVEN = 0.03  # least standard deviation of log exposure: errors of neighbours are alike
 RECENT = 4  # frames that may speak for a step
 
 
@@ -51,7 +50,9 @@ class Shutter:
         misses = (*self.misses, miss)[-RECENT:]
         for count in range(2, len(misses) + 1):
             last = misses[-count:]
-            if abs(sum(m.off for m in last)) > FAR * math.sqrt(count):
+            side = math.copysign(1, miss.off)
+            # Each must be off to the same side by itself: their mean is the new exposure.
+            if all(side * m.off > 1 for m in last) and _sum(last) > FAR * math.sqrt(count):
                 stepped = _mean([m.found for m in last])
                 return Shutter(stepped), stepped
         if abs(miss.off) > FAR:
@@ -77,10 +78,13 @@ def _apart(one: Exposure, other: Exposure) -> float:
     return math.log(one.seconds / other.seconds) / math.hypot(one.doubt, other.doubt)
 
 
+def _sum(misses: Sequence[Miss]) -> float:
+    return abs(sum(m.off for m in misses))
+
+
 def _mean(exposures: Sequence[Exposure]) -> Exposure:
-    """Give the weighted mean; since errors are alike, it is not much better than the best."""
+    """Give the weighted mean."""
     weights = [1 / max(e.doubt, 1e-6) ** 2 for e in exposures]
     logs = [math.log(e.seconds) for e in exposures]
     log = sum(w * x for w, x in zip(weights, logs, strict=True)) / sum(weights)
-    best = min(e.doubt for e in exposures)
-    return Exposure(math.exp(log), max(1 / math.sqrt(sum(weights)), LIKE * best))
+    return Exposure(math.exp(log), max(1 / math.sqrt(sum(weights)), UNEVEN))
