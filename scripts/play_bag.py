@@ -37,11 +37,11 @@ _STAMP = struct.Struct('<iI')  # begins every message with a header, after four 
 
 
 def bag_frames(bag: Path = BAG) -> list[list[tuple[str, bytearray]]]:
-    """Give the messages of each frame: topic and serialised message."""
-    frames: list[list[tuple[str, bytearray]]] = []
+    """Give the messages of each frame, one of a topic each: topic and serialised message."""
+    frames: list[list[tuple[str, bytearray]]] = [[]]
     with BagReader(bag) as reader:
         for message in reader.messages(KINDS.keys()):
-            if message.topic.name == '/camera/rgb/exposure':
+            if message.topic.name in {topic for topic, _ in frames[-1]}:
                 frames.append([])
             frames[-1].append((message.topic.name, bytearray(message.data)))
     return frames
@@ -50,8 +50,11 @@ def bag_frames(bag: Path = BAG) -> list[list[tuple[str, bytearray]]]:
 def play(node: Any, frames: int, rate: float, bag: Path = BAG) -> list[int]:
     """Send this many frames, the bag's over and over; give their stamps [ns]."""
     source = bag_frames(bag)
+    there = {topic for frame in source for topic, _ in frame}
     publishers = {
-        t: node.create_publisher(kind, t, QoSProfile(depth=10)) for t, kind in KINDS.items()
+        t: node.create_publisher(kind, t, QoSProfile(depth=10))
+        for t, kind in KINDS.items()
+        if t in there
     }
     patient = time.monotonic() + PATIENCE_S
     while not all(p.get_subscription_count() for p in publishers.values()):
