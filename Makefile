@@ -8,9 +8,10 @@ SETUP := setup.py setup.cfg pyproject.toml package.xml
 
 # One sample bag through the main job: blurred frames in, sharp frames, motion and pictures out.
 demo: $(VENV)/.demo
-	$(BIN)/depth-deblur replay bags/sample out/demo/bag --overwrite \
+	$(BIN)/depth-deblur replay bags/sample out/demo/bag --overwrite --report \
 	  --pictures out/demo/pictures --estimates out/demo/motion.jsonl
 	@echo 'results    out/demo/bag (a rosbag2 folder; topics: README.md)'
+	@echo 'page       out/demo/bag.html (open it in a browser)'
 	@echo 'pictures   out/demo/pictures (blurred | sharp | depth with the flow)'
 	@echo 'motion     out/demo/motion.jsonl'
 

@@ -141,6 +141,11 @@ def test_links_lead_somewhere(name):
         assert (page.parent / target).exists(), target
 
 
+def test_pictures_in_the_docs_are_small():
+    for path in (ROOT / 'docs').iterdir():
+        assert path.suffix == '.md' or path.stat().st_size < 200_000, path.name
+
+
 def test_the_core_works_without_ros_and_bag_libraries():
     blocked = sorted(ROS | {'lz4', 'mcap', 'mcap_ros2', 'rosbags', 'zstandard', 'yaml', 'tqdm'})
     code = f"""
