@@ -27,6 +27,7 @@ T = TypeVar('T')
 
 OVERTAKEN = 'overtaken by a newer pair while the solver was busy'
 KEPT = 30  # frames that may wait for their depth: a second of 30 Hz
+PATIENCE_NS = 2_000_000_000  # no depth comes later than that
 KEPT_INFOS = 30
 KEPT_EXPOSURES = 300
 # glibc's M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_TOP_PAD, bytes: an image's memory stays with the
@@ -176,7 +177,11 @@ class Intake:
 
     def settle(self, came_before_ns: int) -> None:
         """Wait no longer for a nearer depth of the colour messages that came before this time."""
-        self._offer(self._pairer.settle(lambda pair: pair.log_ns <= came_before_ns))
+        found = self._pairer.settle(
+            lambda pair: pair.log_ns <= came_before_ns,
+            lambda pair: pair.log_ns <= came_before_ns - PATIENCE_NS,
+        )
+        self._offer(found)
 
     def change_slop(self, slop_s: float) -> None:
         """Pair by another slop from now on."""

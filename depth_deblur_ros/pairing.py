@@ -75,12 +75,19 @@ class StampPairer(Generic[A, B]):
         """Give the remaining pairs: nothing more will come."""
         return self._decide(waiting=False)
 
-    def settle(self, due: Callable[[A], bool]) -> list[tuple[A, B]]:
-        """Give the pairs of due colour frames: a depth that is near enough is good enough."""
+    def settle(
+        self, due: Callable[[A], bool], overdue: Callable[[A], bool] = lambda _: False
+    ) -> list[tuple[A, B]]:
+        """
+        Give the pairs of due colour frames: a depth that is near enough is good enough.
+
+        Overdue ones without such a depth are dropped.
+        """
         pairs = []
         while self._colour:
             stamp = min(self._colour)
-            if not due(self._colour[stamp]) or self._nearest(stamp) is None:
+            item, found = self._colour[stamp], self._nearest(stamp) is not None
+            if not ((found and due(item)) or overdue(item)):
                 break
             pairs += self._decide_one(stamp)
         self._forget()

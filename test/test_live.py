@@ -4,7 +4,16 @@ import threading
 from types import SimpleNamespace
 
 from depth_deblur_ros.core.evidence import template_table
-from depth_deblur_ros.live import compile_kernels, InfoHistory, Intake, Mailbox, OVERTAKEN, Worker
+from depth_deblur_ros.live import (
+    compile_kernels,
+    InfoHistory,
+    Intake,
+    Mailbox,
+    OVERTAKEN,
+    PATIENCE_NS,
+    Worker,
+)
+from depth_deblur_ros.pairing import NO_DEPTH
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -154,6 +163,18 @@ def test_without_a_depth_near_enough_the_slop_changes_nothing():
     intake.push_colour(message(143), came_ns=0)
     intake.push_depth(message(144))
     assert (intake.pairs, intake.unused_depths) == (2, 1)  # the one at 50
+
+
+def test_a_colour_frame_does_not_wait_for_ever():
+    intake = Intake(0.02)
+    intake.push_depth(message(50))
+    intake.push_colour(message(110), came_ns=0)
+    intake.settle(came_before_ns=PATIENCE_NS - 1)
+    assert intake.waiting == 1
+    intake.settle(came_before_ns=PATIENCE_NS)
+    assert (intake.waiting, intake.dropped) == (0, {NO_DEPTH: 1})
+    intake.push_depth(message(110))  # far too late
+    assert intake.pairs == 0
 
 
 def test_an_exposure_belongs_to_the_images_after_it():
