@@ -101,6 +101,8 @@ def test_a_sideways_shift_blurs_like_a_box_as_long_as_its_flow(length, kernel, u
 def test_samples_follow_the_longest_blur_within_limits():
     for length, samples in ((0, MIN_SAMPLES), (20.5, 21), (500, MAX_SAMPLES)):
         assert shift(length / 32).inverse_depth.shape[2] == samples
+    motion, depth = Motion(np.zeros(3), [30 / 32, 0, 0]), np.full((48, 64), 2, np.float32)
+    assert blur_operator(motion, depth, CAMERA, 1.5).inverse_depth.shape[2] == 20
 
 
 @pytest.mark.parametrize('sign', [1, -1])

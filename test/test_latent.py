@@ -5,16 +5,17 @@ from depth_deblur_ros.core import latent
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.latent import (
-    _conjugate_gradients,
     _link_weights,
     _POWERS,
-    _reweighted,
     _sum_rows,
+    conjugate_gradients,
     EPSILON,
     EXPONENT,
     LatentSteps,
     noise_sigma,
+    restore_coarse_to_fine,
     restore_latent,
+    reweighted,
 )
 from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
 from depth_deblur_ros.core.sweep import GUARD
@@ -173,7 +174,7 @@ def quadratic():
     light, trust = light_from_stored(taken, 'srgb'), 1 / np.square(light_slope(taken, 'srgb'))
     first = sweep.widened(light)
     stored = stored_from_light(first, 'srgb')
-    problem = _reweighted(stored, sweep, 'srgb', trust, WEIGHT)
+    problem = reweighted(stored, sweep, 'srgb', trust, WEIGHT)
     matrix, shape = oracle.blur_matrix(blur), blur.latent_shape
     rim = sweep.room - blur.margin
     links, scale = (
@@ -189,7 +190,7 @@ def quadratic():
 
     def after(limit):
         missing = light - sweep.gather(first, np.ones_like(light))
-        return _conjugate_gradients(problem, first, missing, limit)
+        return conjugate_gradients(problem, first, problem.slope(missing, first), limit)
 
     return first, value, after
 
@@ -239,6 +240,19 @@ def test_the_restored_picture_is_closer_to_the_sharp_one(transfer, sigma):
     restored = restore_latent(taken, blur, transfer, sigma, STEPS)
     assert 0 <= restored.min() <= restored.max() <= 1
     assert rms(restored - sharp) < 0.5 * rms(taken - sharp)
+
+
+def test_a_coarse_start_brings_the_same_steps_closer():
+    camera = CameraIntrinsics(128.0, 128.0, 79.5, 63.5, 160, 128)
+    depth, motion = np.full((128, 160), 2, np.float32), Motion(np.zeros(3), [16 / 64, 0, 0])
+    blur, steps = blur_operator(motion, depth, camera), LatentSteps(2.7, 1, 10)
+    height, width, _ = blur.latent_shape
+    wide = cv2.resize(cards(1, (height // 4, width // 4)), (width, height))
+    taken = stored_from_light(blur.apply(light_from_stored(wide, 'srgb')), 'srgb')
+    plain = restore_latent(taken, blur, 'srgb', noise_sigma(taken), steps)
+    coarse = restore_coarse_to_fine(taken, depth, motion, camera, steps)
+    sharp = blur.crop(wide)
+    assert rms(coarse - sharp) < 0.8 * rms(plain - sharp) < 0.8 * rms(taken - sharp)
 
 
 def test_saturated_pixels_do_not_darken_a_lamp(monkeypatch):

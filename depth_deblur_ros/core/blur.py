@@ -102,32 +102,37 @@ class BlurOperator:
 
     def _apply_by_blocks(self, latent: FloatImage) -> FloatImage:
         planes = np.zeros(self.sweep.latent_shape, np.float32)
-        self._latent_of(planes)[:] = np.moveaxis(latent, 2, 0)
+        self.latent_part(planes)[:] = np.moveaxis(latent, 2, 0)
         one = self.sweep.blurred_planes(np.ones(self._shape, np.float32))
         blurred = self.sweep.gather(planes, one)
         return np.ascontiguousarray(np.moveaxis(blurred[..., : self._shape[1]], 0, 2))
 
     def _adjoint_by_blocks(self, blurred: FloatImage) -> FloatImage:
         planes = self.sweep.adjoint(self.sweep.blurred_planes(blurred))
-        return np.ascontiguousarray(np.moveaxis(self._latent_of(planes), 0, 2))
+        return np.ascontiguousarray(np.moveaxis(self.latent_part(planes), 0, 2))
 
-    def _latent_of(self, planes: FloatImage) -> FloatImage:
+    def latent_part(self, planes: FloatImage) -> FloatImage:
         """Look at the part of latent planes that this operator's latent image is."""
         height, width, _ = self.latent_shape
         first = self.sweep.room - self.margin
         return planes[:, first : first + height, first : first + width]
 
 
-def blur_operator(motion: Motion, depth: FloatImage, camera: CameraIntrinsics) -> BlurOperator:
-    """Build A for a motion over the exposure; depth (H, W) filled [m]."""
+def blur_operator(
+    motion: Motion, depth: FloatImage, camera: CameraIntrinsics, spacing: float = 1.0
+) -> BlurOperator:
+    """
+    Build A for a motion over the exposure; depth (H, W) filled [m].
+
+    spacing: px of the longest blur from one instant to the next, where the limits allow it.
+    """
     ray, packed = pack(motion, camera)
     flow = flow_parts(ray, packed, depth.shape)
     longest = math.sqrt(_largest(nearness_of(depth)[:, None], flow)[2])
-    samples = int(np.clip(math.ceil(longest - ROUNDING), MIN_SAMPLES, MAX_SAMPLES))
+    samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), MIN_SAMPLES, MAX_SAMPLES))
     seen = seen_inverse_depth(motion, depth, camera, samples)
     reach = max(_largest(np.moveaxis(seen, 2, 1), flow)[:2]) / 2
-    # 2 for the interpolation.
-    margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2
+    margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: interpolation
     return BlurOperator(ray, packed, seen, margin)
 
 

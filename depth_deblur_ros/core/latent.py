@@ -18,8 +18,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from depth_deblur_ros.core.blur import BlurOperator
-from depth_deblur_ros.core.data import FloatImage
+import cv2
+from depth_deblur_ros.core.blur import blur_operator, BlurOperator
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, MIN_SIDE, Motion
 from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
 from depth_deblur_ros.core.sweep import GUARD, Sweep
@@ -29,6 +30,8 @@ import numpy as np
 SATURATED = 0.99  # stored values above may stand for any amount of light
 EPSILON = 0.01  # stored units; differences below this count as noise
 EXPONENT = 0.8  # alpha of the prior [KF09]
+SPACING = 1.5  # px of the longest blur between two instants of the exposure
+COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
 # Least sigma [stored units]: 8 bit rounding for averaged values; real cameras hide their noise
 # from the estimate by demosaicing, and lens and shutter leave more unexplained.
 SIGMA_FLOOR = {'linear': 0.0025, 'srgb': 0.012}
@@ -61,27 +64,69 @@ def noise_sigma(stored: FloatImage) -> float:
     return float(np.sqrt(np.percentile(power, 20) / 36))
 
 
-def restore_latent(
-    blurred: FloatImage, blur: BlurOperator, transfer: str, sigma: float, steps: LatentSteps
+def restore_coarse_to_fine(
+    blurred: FloatImage,
+    depth: FloatImage,
+    motion: Motion,
+    camera: CameraIntrinsics,
+    steps: LatentSteps,
 ) -> FloatImage:
-    """Give the sharp image (H, W, 3), stored values, of one under a known blur."""
+    """
+    Give the sharp image (H, W, 3), stored values, under a known motion; depth (H, W) filled [m].
+
+    At half the size an eighth of the work brings most of what is long and slow to converge.
+    """
+    sigma, first = noise_sigma(blurred), None
+    width, height = camera.width // 2, camera.height // 2
+    if min(width, height) >= MIN_SIDE:
+        small = _resized(blurred, width, height, cv2.INTER_AREA)
+        near = _resized(depth, width, height, cv2.INTER_NEAREST)
+        blur = blur_operator(motion, near, camera.scaled(width, height), SPACING)
+        inner = round(COARSE_LONGER * steps.inner)
+        coarse = LatentSteps(steps.prior, COARSE_OUTER, inner)
+        # Four pixels in one: half the noise.
+        half = restore_latent(small, blur, camera.transfer, sigma / 2, coarse)
+        first = np.clip(_resized(half, camera.width, camera.height, cv2.INTER_CUBIC), 0, 1)
+    blur = blur_operator(motion, depth, camera, SPACING)
+    return restore_latent(blurred, blur, camera.transfer, sigma, steps, first=first)
+
+
+def _resized(image: FloatImage, width: int, height: int, how: int) -> FloatImage:
+    return np.asarray(cv2.resize(image, (width, height), interpolation=how), np.float32)
+
+
+def restore_latent(
+    blurred: FloatImage,
+    blur: BlurOperator,
+    transfer: str,
+    sigma: float,
+    steps: LatentSteps,
+    *,
+    first: FloatImage | None = None,
+) -> FloatImage:
+    """Give the sharp image (H, W, 3), stored values, of one under a known blur; first: a guess."""
     sweep, (height, width) = blur.sweep, blurred.shape[:2]
     stored = sweep.blurred_planes(blurred)
     light = light_from_stored(stored, transfer)
     full, noise = stored >= SATURATED, 1 / np.square(light_slope(stored, transfer))
     noise[:, :, width:] = 0
-    latent = sweep.widened(light[:, :, :width])
+    start = light[:, :, :width] if first is None else _light_planes(first, transfer)
+    latent = sweep.widened(start)
     within = sweep.blurred_planes(np.ones_like(blurred))
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for _ in range(steps.outer):
         missing = light - sweep.gather(latent, within)
         # What is saturated says only "at least this": drop it where the model gives more.
         trust = np.where(full & (missing <= 0), np.float32(0), noise)
-        problem = _reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
-        latent = _conjugate_gradients(problem, latent, missing, steps.inner)
+        problem = reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
+        latent = conjugate_gradients(problem, latent, problem.slope(missing, latent), steps.inner)
     r = sweep.room
     sharp = stored_from_light(latent[:, r : r + height, r : r + width], transfer)
     return np.ascontiguousarray(np.moveaxis(sharp, 0, 2))
+
+
+def _light_planes(stored: FloatImage, transfer: str) -> FloatImage:
+    return light_from_stored(np.ascontiguousarray(np.moveaxis(stored, 2, 0)), transfer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +162,7 @@ class Quadratic:
         return float(products.sum(dtype=np.float64))
 
 
-def _reweighted(
+def reweighted(
     stored: FloatImage, sweep: Sweep, transfer: str, trust: FloatImage, weight: np.float32
 ) -> Quadratic:
     """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
@@ -127,11 +172,11 @@ def _reweighted(
     return Quadratic(sweep, trust, links, ease)
 
 
-def _conjugate_gradients(
-    problem: Quadratic, latent: FloatImage, missing: FloatImage, limit: int
+def conjugate_gradients(
+    problem: Quadratic, latent: FloatImage, slope: FloatImage, limit: int
 ) -> FloatImage:
-    """Solve from latent by `limit` steps, preconditioned with l'^2; missing = B - A latent."""
-    latent, r = latent.copy(), problem.slope(missing, latent)
+    """Solve from latent by `limit` steps, preconditioned with l'^2; slope = minus the gradient."""
+    latent, r = latent.copy(), slope.copy()
     d, q, strips = np.zeros_like(r), np.zeros_like(r), problem.sweep.strips()
     products = np.zeros(r.shape[1], np.float32)
     _advance(latent, r, d, q, problem.ease, np.float32(0), products)
