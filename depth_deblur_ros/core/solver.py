@@ -18,7 +18,6 @@ import time
 
 import cv2
 from depth_deblur_ros.core.alternation import alternate, restore
-from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import (
     DeblurResult,
     EnergyStep,
@@ -29,12 +28,14 @@ from depth_deblur_ros.core.data import (
 )
 from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
-from depth_deblur_ros.core.latent import LatentSteps, noise_sigma, restore_latent
+from depth_deblur_ros.core.latent import LatentSteps, restore_coarse_to_fine
 from depth_deblur_ros.core.light import light_from_stored, stored_from_light
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
 import numba
 import numpy as np
+
+FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
 
 
 def deblur(
@@ -97,10 +98,11 @@ def _restored(
         latent = restore(light, depth, camera, motion.vector, params)
         sharp = stored_from_light(latent, camera.transfer)
     else:
-        blur = blur_operator(motion, depth, camera)
-        outer = 1 if params.mode == 'fast' else params.reweightings
-        steps = LatentSteps(params.prior, outer, params.cg_steps)
-        sharp = restore_latent(colour, blur, camera.transfer, noise_sigma(colour), steps)
+        steps = LatentSteps(params.prior, params.reweightings, params.cg_steps)
+        if params.mode == 'fast':
+            inner = round(FAST_LONGER * steps.inner)
+            steps = LatentSteps(steps.prior, min(FAST_OUTER, steps.outer), inner)
+        sharp = restore_coarse_to_fine(colour, depth, motion, camera, steps)
     return np.ascontiguousarray(sharp[..., 0]) if frame.image.ndim == 2 else sharp
 
 
