@@ -224,15 +224,14 @@ def test_a_grey_frame_is_solved_as_its_colour_twin(small_frame, small_result):
     np.testing.assert_allclose(result.image[..., 1], small_result.image, atol=2e-3)
 
 
-def test_the_motion_alone_leaves_the_image(small_frame, small_result):
+def test_the_motion_alone_leaves_the_image(small_frame):
     result = deblur(small_frame, SolverParams(mode='motion'))
     np.testing.assert_array_equal(result.image, small_frame.image)
-    same(result, small_result, but=('seconds', 'image'))
+    same(result, deblur(small_frame, SolverParams(mode='fast')), but=('seconds', 'image'))
 
 
-def test_fast_is_another_image_of_the_same_motion(small_frame, small_result):
+def test_fast_improves_the_image(small_frame):
     result = deblur(small_frame, SolverParams(mode='fast'))
-    np.testing.assert_array_equal(result.motion.vector, small_result.motion.vector)
     truth = texture(1, (160, 224))
     assert psnr(result.image, truth) > psnr(small_frame.image, truth) + 1
 

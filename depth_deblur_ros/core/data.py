@@ -22,6 +22,7 @@ Vector = npt.NDArray[np.float64]
 TRANSFERS = ('srgb', 'linear')
 MAX_PIXELS = 64_000_000  # more than any camera on a robot; refuses a lying header early
 MIN_SIDE = 32  # px; below this no patch of the blind start fits
+FAR = 20  # widths or heights that the principal point of a cut-out may lie off
 FOCAL_RATIO = (0.1, 20.0)  # focal length over image width: a 157 degree and a 3 degree lens
 
 
@@ -67,8 +68,10 @@ class CameraIntrinsics:
             _check_focal(name, getattr(self, name), self.width)
         for name, side in (('cx', self.width), ('cy', self.height)):
             value = getattr(self, name)
-            if not _is_number(value) or not -side <= value <= 2 * side:
-                raise InputError(f'{name} must lie in [{-side}, {2 * side}] px, got {value}')
+            if not _is_number(value) or not -FAR * side <= value <= FAR * side:
+                raise InputError(
+                    f'{name} must lie in [{-FAR * side}, {FAR * side}] px, got {value}'
+                )
         if self.distortion is not None:
             _check_distortion(self.distortion)
         if self.transfer not in TRANSFERS:

@@ -4,9 +4,10 @@ The page that tells the algorithm: from one blurred RGB-D frame to the sharp ima
 1 fill the depth map's holes, guided by the colours (depth.py)
 2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or
   find that there is no blur or nothing to trust: then the frame passes unchanged
-3 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
+3 in mode full, move on to where the image itself is likeliest (joint.py)
+4 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
 
-With `method` paper, 2 and 3 are the paper's: alternation.py.
+With `method` paper, 2 to 4 are the paper's: alternation.py.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from depth_deblur_ros.core.data import (
 )
 from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.joint import refine
 from depth_deblur_ros.core.latent import LatentSteps, restore_coarse_to_fine
 from depth_deblur_ros.core.light import light_from_stored, stored_from_light
 from depth_deblur_ros.core.params import SolverParams
@@ -57,6 +59,9 @@ def deblur(
             result = _finish(frame, depth, found, params, began)
             return replace(result, energies=energies)
         found = blind_start(_grey(frame.image), depth, frame.camera, start)
+        if params.mode == 'full' and found.outcome is Outcome.SOLVED:
+            light = _grey(light_from_stored(frame.image, frame.camera.transfer))
+            found = replace(found, motion=refine(light, depth, frame.camera, found.motion))
         return _finish(frame, depth, found, params, began)
 
 

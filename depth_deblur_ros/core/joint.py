@@ -1,0 +1,133 @@
+"""
+The joint refinement: from what the spectra tell to the motion that makes the image likeliest.
+
+The spectra (start.py) tell the motion to half a pixel and cannot go far wrong; the likelihood
+(likelihood.py) knows it to a tenth, near by. Four parts of the frame are asked; where they
+disagree by more than chance, their word counts for less and the start's for more,
+docs/method.md (19).
+
+Notation: p (6,) motion; g_k, H_k slope and curvature of part k; C_0 the start's covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+import math
+
+import cv2
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vector
+from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.light import stored_from_light
+from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+import numpy as np
+
+READABLE = 24.0  # px; longer blurs are refined at half the size, or less
+BUDGET = 80_000  # px that are looked at: more of them hardly change the motion
+SATURATED = 0.97  # stored values
+LEAST_SIDE = 48  # px of a part
+MOVES = 4
+LONGEST_MOVE, LEAST_MOVE = 1.0, 0.02  # px
+SOFTEST, DISSENT = 10.0, 4.0  # what the likelihood is divided by: at least; per chi^2 of the parts
+BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
+
+
+def refine(
+    light: FloatImage, depth: FloatImage, camera: CameraIntrinsics, start: Motion
+) -> Motion:
+    """
+    Give the motion, with its covariance, that makes blurred grey light (H, W) likeliest.
+
+    depth (H, W) filled [m]; start: from the spectra, with its covariance, which takes part.
+    """
+    assert start.covariance is not None
+
+    def length(p: Vector) -> float:
+        return blur_length(p, depth, camera)
+
+    certainty = np.asarray(np.linalg.inv(start.covariance), np.float64)
+    parts = _parts(light, depth, camera, length(start.vector))
+    parts = [settled(part, start.vector) for part in parts]
+    return _moved(parts, start.vector, certainty, length)
+
+
+def _moved(
+    parts: list[Part], start: Vector, certainty: Vector, length: Callable[[Vector], float]
+) -> Motion:
+    """Go where the slope of the likelihood and the pull of the start balance."""
+    found = [posterior(part, start) for part in parts]
+    slopes, images = zip(*map(slope_of, found), strict=True)
+    bends = np.array([curvature_of(*pair) for pair in zip(found, images, strict=True)])
+    bend, gs, p = bends.sum(0), np.array(slopes), start
+    for k in range(MOVES):
+        soft = _softening(gs, bends)
+        force = gs.sum(0) / soft + certainty @ (p - start)
+        move = -np.linalg.solve(bend / soft + certainty, force)
+        move *= min(1.0, LONGEST_MOVE / max(length(move), 1e-9))
+        p = p + move
+        if length(move) < LEAST_MOVE or k == MOVES - 1:
+            break
+        last, gs = gs.sum(0), np.array([slope_of(posterior(part, p))[0] for part in parts])
+        bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
+    return Motion.from_vector(p, np.linalg.inv(bend / soft + certainty))
+
+
+def _softening(gs: Vector, bends: Vector) -> float:
+    """Give by how much the parts (n, 6), (n, 6, 6) are off their common optimum, in chi^2."""
+    common = -np.linalg.solve(bends.sum(0), gs.sum(0))
+    left = gs + bends @ common
+    chi = float(np.sum(left * np.linalg.solve(bends, left[..., None])[..., 0]))
+    return max(SOFTEST, DISSENT * chi / (6 * (len(gs) - 1)))
+
+
+def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
+    """Correct the curvature (6, 6) by how a move changed the slope, within BENDS of the first."""
+    rest = change - bend @ move
+    weight = float(rest @ move)
+    if abs(weight) > 1e-8 * float(np.linalg.norm(rest) * np.linalg.norm(move)):
+        bend = bend + np.outer(rest, rest) / weight
+    root = np.linalg.cholesky(first)
+    inner = np.linalg.solve(root, np.linalg.solve(root, bend).T)
+    values, vectors = np.linalg.eigh((inner + inner.T) / 2)
+    half = root @ vectors
+    return np.asarray(half * np.clip(values, *BENDS) @ half.T)
+
+
+def _parts(
+    light: FloatImage, depth: FloatImage, camera: CameraIntrinsics, length: float
+) -> list[Part]:
+    """Choose one part of each quarter, the most textured, at a size where the blur is READABLE."""
+    factor = 1
+    while length > READABLE * factor and min(light.shape) >= 4 * LEAST_SIDE * factor:
+        factor *= 2
+    if factor > 1:
+        size = (camera.width // factor, camera.height // factor)
+        light = np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA), np.float32)
+        depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        camera = camera.scaled(*size)
+    height, width = (side // 2 for side in light.shape)
+    share = min(1.0, math.sqrt(BUDGET / light.size))
+    rows, columns = int(height * share), int(width * share)
+    parts = []
+    for k in range(4):
+        top, left = k // 2 * height, k % 2 * width
+        quarter = light[top : top + height, left : left + width]
+        y, x = _busiest(stored_from_light(quarter, camera.transfer), rows, columns)
+        box = np.s_[top + y : top + y + rows, left + x : left + x + columns]
+        cut = replace(
+            camera, cx=camera.cx - left - x, cy=camera.cy - top - y, width=columns, height=rows
+        )
+        own = np.ascontiguousarray(light[box])
+        counts = (stored_from_light(own, camera.transfer) < SATURATED).astype(np.float32)
+        parts.append(Part(own, counts, np.ascontiguousarray(depth[box]), cut, k))
+    return parts
+
+
+def _busiest(stored: FloatImage, rows: int, columns: int) -> tuple[int, int]:
+    """Find the window of this size with the strongest gradients; its first row and column."""
+    down, aside = np.gradient(stored)
+    sums = np.pad(np.hypot(down, aside).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    inside = sums[rows:, columns:] - sums[:-rows, columns:]
+    inside = inside - sums[rows:, :-columns] + sums[:-rows, :-columns]
+    y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return int(y), int(x)

@@ -1,0 +1,203 @@
+"""
+How likely a motion makes the blurred image: the slope of the likelihood, and its curvature.
+
+If the best latent images of two motions are compared, the shorter motion wins: blurred images
+cost least. What counts is how likely the blurred image is over all latent images; the slope of
+that in p is the slope of the data term, averaged over what the latent image may be [LWDF11]. The
+average is taken over the best image and samples of what is left open about it, as three planes of
+one image step, docs/method.md (16) to (18).
+
+Notation: B blurred grey light; L = mu + s latent light, mu the best for p, s the rest,
+s ~ N(0, sigma^2 (A' W A + R)^-1); R the prior's links (latent.py), W = 1 / l'^2;
+J x = d (A_p x) / d p.
+
+    g(p) = (<J mu, W (A mu - B)> + mean over s of <J s, W A s>) / sigma^2
+
+[LWDF11] Levin, Weiss, Durand & Freeman, CVPR 2011. [K75] Kaufman, BIT 15, 1975.
+[PY11] Papandreou & Yuille, ICCV 2011: samples by perturbing the data and the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+import math
+
+from depth_deblur_ros.core.blur import blur_operator, BlurOperator
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vector
+from depth_deblur_ros.core.latent import conjugate_gradients, Quadratic, reweighted
+from depth_deblur_ros.core.light import light_slope, stored_from_light
+from depth_deblur_ros.core.motion import blur_and_slope
+import numpy as np
+
+REWEIGHTINGS, STEPS = 3, 10  # of the image step
+SETTLING = 5  # reweightings after each of which noise and prior follow the image
+SIGMAS, PRIORS = (5e-4, 0.1), (0.2, 60.0)  # where they stay
+OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # of the links, in rows and columns
+AROUND = 64  # px of noise beyond a part of the frame, so that its margin may change
+
+Places = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Noise sigma [stored values] and the weight of the prior, as a part of the image has them."""
+
+    sigma: float = 0.005
+    prior: float = 2.7
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of the frame: grey light and depth [m] (H, W), what counts of it, its own camera."""
+
+    light: FloatImage
+    counts: FloatImage  # (H, W): 0 where saturated, else 1
+    depth: FloatImage
+    camera: CameraIntrinsics
+    seed: int  # of its noise, which stays the same while the motion changes
+    scales: Scales = Scales()
+
+    @property
+    def slope(self) -> FloatImage:
+        """Give l' (H, W), by which noise of stored values becomes noise of light."""
+        transfer = self.camera.transfer
+        return light_slope(stored_from_light(self.light, transfer), transfer)
+
+    @property
+    def trust(self) -> FloatImage:
+        """Give W (H, W)."""
+        return np.asarray(self.counts / self.slope**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What the latent image of a part may be under a motion: planes mu, s, s' (3, h, w)."""
+
+    part: Part
+    blur: BlurOperator
+    problem: Quadratic
+    latent: FloatImage
+
+
+def settled(part: Part, p: Vector) -> Part:
+    """Let noise and prior follow what is left of the data and what the latent image is made of."""
+    return _posterior(part, p, SETTLING, follow=True).part
+
+
+def posterior(part: Part, p: Vector) -> Posterior:
+    """Find mu and two samples s for a motion p (6,)."""
+    return _posterior(part, p, REWEIGHTINGS, follow=False)
+
+
+def _posterior(part: Part, p: Vector, reweightings: int, *, follow: bool) -> Posterior:
+    """Run the image step on three planes: the image, and two of noise alone."""
+    blur = blur_operator(Motion.from_vector(p), part.depth, part.camera)
+    sweep, transfer = blur.sweep, part.camera.transfer
+    height, width = part.light.shape
+    noise = part.slope * _noise(part.seed, height, width)[-1, :, :, :width]
+    data = sweep.blurred_planes(np.stack([part.light, *noise], 2))
+    data[1:] *= part.scales.sigma
+    trust = sweep.blurred_planes(np.repeat(part.trust[..., None], 3, 2))
+    within = sweep.blurred_planes(np.ones((height, width, 3), np.float32))
+    latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
+    for _ in range(reweightings):
+        sigma = part.scales.sigma
+        stored = np.repeat(stored_from_light(latent[:1], transfer), 3, 0)
+        weight = np.float32(part.scales.prior * sigma**2)
+        problem = reweighted(stored, sweep, transfer, trust, weight)
+        push = problem.slope(data - sweep.gather(latent, within), latent)
+        push[1:] += sigma * _prior_noise(problem, part.seed)
+        latent = conjugate_gradients(problem, latent, push, STEPS)
+        if follow:
+            missing = data - sweep.gather(latent, within)
+            missing[1:] -= data[1:]
+            part = replace(part, scales=_followed(part, problem, latent, missing))
+            for planes in (data, latent):
+                planes[1:] *= part.scales.sigma / sigma
+    return Posterior(part, blur, problem, latent)
+
+
+def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: FloatImage) -> Scales:
+    """Give the scales under which data and prior cost as much as their numbers say, (18)."""
+    sigma, prior = part.scales.sigma, part.scales.prior
+    planes = np.array([1, 0.5, 0.5])
+    data = np.square(missing) * problem.trust
+    left = float(planes @ data.sum((1, 2), dtype=np.float64)) / max(part.counts.sum(), 1.0)
+    rough = float(planes @ _roughness(problem, latent)) / sigma**2
+    return Scales(
+        float(np.clip(math.sqrt(left), *SIGMAS)), float(np.clip(prior / max(rough, 1e-9), *PRIORS))
+    )
+
+
+def _roughness(problem: Quadratic, latent: FloatImage) -> Vector:
+    """Give x' R x per pixel of each plane (3,)."""
+    total = np.zeros(3)
+    for k, (here, there) in enumerate(_ends(latent.shape[1:])):
+        square = np.square(latent[(slice(None), *there)] - latent[(slice(None), *here)])
+        total += np.tensordot(square, _link(problem, k, here, there), 2)
+    return np.asarray(total / latent[0].size)
+
+
+def _prior_noise(problem: Quadratic, seed: int) -> FloatImage:
+    """Give R^(1/2) n for two fields of unit noise n (2, h, w), laid out from the part's corner."""
+    _, height, width = problem.ease.shape
+    out = np.zeros((2, height, width), np.float32)
+    room = problem.sweep.room
+    first = max(AROUND - room, 0)
+    noise = _noise(seed, max(height - 2 * room + 2 * AROUND, height), width + 2 * AROUND)
+    noise = noise[:, :, first : first + height, first : first + width]
+    for k, (here, there) in enumerate(_ends((height, width))):
+        n = np.sqrt(_link(problem, k, here, there)) * noise[(k, slice(None), *here)]
+        out[(slice(None), *here)] += n
+        out[(slice(None), *there)] -= n
+    return out
+
+
+@lru_cache(maxsize=16)
+def _noise(seed: int, height: int, width: int) -> FloatImage:
+    """Give unit noise (5, 2, height, at least width): of four links, and of the data."""
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal((5, 2, height, -(-width // 128) * 128), np.float32)
+
+
+def _ends(shape: tuple[int, ...]) -> list[tuple[Places, Places]]:
+    """Give the places from which the links of each offset start, and where they end."""
+    height, width = shape
+    places = []
+    for down, aside in OFFSETS:
+        left, right = max(-aside, 0), width - max(aside, 0)
+        here = (slice(0, height - down), slice(left, right))
+        places.append((here, (slice(down, height), slice(left + aside, right + aside))))
+    return places
+
+
+def _link(problem: Quadratic, k: int, here: Places, there: Places) -> FloatImage:
+    ease = problem.ease[0]
+    return np.asarray(problem.links[k][here] * np.minimum(ease[here], ease[there]))
+
+
+def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
+    """Give g (6,), (16), and J mu (H, W, 6)."""
+    blur, part = found.blur, found.part
+    latent = np.ascontiguousarray(np.moveaxis(blur.latent_part(found.latent), 0, 2))
+    missing, slope = blur_and_slope(blur.motion[:6].astype(np.float64), latent, blur)
+    missing[..., 0] -= part.light
+    missing *= part.trust[..., None] * np.array([1, 0.5, 0.5], np.float32)
+    g = slope.reshape(-1, 6).T.astype(np.float64) @ missing.reshape(-1).astype(np.float64)
+    return g / part.scales.sigma**2, slope[..., 0, :]
+
+
+def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
+    """Give <J, W (J - A z)> / sigma^2 (6, 6), z how mu answers to a change of p [K75], (17)."""
+    sweep, width = found.blur.sweep, slope.shape[1]
+    rest = np.empty_like(slope)
+    for half in (slice(0, 3), slice(3, 6)):
+        columns = sweep.blurred_planes(slope[..., half])
+        push = sweep.adjoint(found.problem.trust * columns)
+        z = conjugate_gradients(found.problem, np.zeros_like(push), push, STEPS)
+        answered = columns - sweep.gather(z, np.ones_like(columns))
+        rest[..., half] = np.moveaxis(answered, 0, 2)[:, :width]
+    weighted = found.part.trust[..., None] * slope
+    h = weighted.reshape(-1, 6).T.astype(np.float64) @ rest.reshape(-1, 6).astype(np.float64)
+    return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2

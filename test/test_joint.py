@@ -1,0 +1,114 @@
+"""The joint refinement: nearer to the truth than its start, and nowhere without a reason."""
+
+from depth_deblur_ros.core import joint
+from depth_deblur_ros.core.blur import blur_operator
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion
+from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.joint import refine
+from depth_deblur_ros.core.start import motion_axes
+import numpy as np
+from pictures import texture
+import pytest
+
+CAMERA = CameraIntrinsics(180.0, 180.0, 111.5, 79.5, 224, 160, transfer='linear')
+DEPTH = np.float32(1.5 + np.indices((160, 224))[1] / 224)
+TRUTH = np.array([0.01, 0.05, 0.02, 0, 0, 0])
+
+
+def blurred(truth, sigma=0.004):
+    """Blur a texture by exact averaging over a motion, with noise."""
+    blur = blur_operator(Motion.from_vector(truth), DEPTH, CAMERA)
+    high, wide, _ = blur.latent_shape
+    latent = np.repeat(texture(3, (high, wide))[..., None], 3, 2).astype(np.float32)
+    noise = sigma * np.random.default_rng(1).standard_normal(DEPTH.shape)
+    return np.float32(blur.apply(latent)[..., 0] + noise)
+
+
+def start(p, sd=0.7):
+    """Give a motion with the covariance of so many pixels each way."""
+    axes = motion_axes(DEPTH, CAMERA)
+    return Motion.from_vector(p, sd**2 * axes @ axes.T)
+
+
+def off(p, truth=TRUTH):
+    return blur_length(p - truth, DEPTH, CAMERA)
+
+
+@pytest.mark.parametrize('factor', [0.9, 1.1])
+def test_a_start_that_is_too_short_or_too_long_comes_nearer(factor):
+    found = refine(blurred(TRUTH), DEPTH, CAMERA, start(factor * TRUTH))
+    assert off(found.vector) < 0.4 * off(factor * TRUTH)
+
+
+def test_the_truth_stays():
+    found = refine(blurred(TRUTH), DEPTH, CAMERA, start(TRUTH))
+    assert off(found.vector) < 0.2
+
+
+def test_a_plain_wall_leaves_the_start():
+    plain = np.full(DEPTH.shape, 0.5, np.float32)
+    found = refine(plain, DEPTH, CAMERA, start(TRUTH))
+    assert off(found.vector) < 0.01
+
+
+def test_an_image_that_tells_something_narrows_the_covariance():
+    begun = start(TRUTH)
+    found = refine(blurred(TRUTH), DEPTH, CAMERA, begun)
+    axes = np.linalg.inv(motion_axes(DEPTH, CAMERA))
+    sd = np.sqrt(np.diag(axes @ found.covariance @ axes.T))
+    assert (sd <= 0.7 + 1e-9).all()
+    assert sd[0] < 0.35
+
+
+def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
+    monkeypatch.setattr(joint, 'READABLE', 5.0)
+    monkeypatch.setattr(joint, 'LEAST_SIDE', 40)
+    parts = joint._parts(blurred(TRUTH), DEPTH, CAMERA, 9.0)
+    assert {part.light.shape for part in parts} == {(40, 56)}
+    fx = {part.camera.fx for part in parts}
+    assert fx == {CAMERA.fx / 2}
+
+
+def test_parts_lie_where_the_picture_is_busy(monkeypatch):
+    monkeypatch.setattr(joint, 'BUDGET', 160 * 224 // 4)
+    light = np.full(DEPTH.shape, 0.5, np.float32)
+    light[10:40, 60:100] += texture(0, (30, 40)) - 0.5
+    part = joint._parts(light, DEPTH, CAMERA, 5.0)[0]
+    assert part.light.std() > 0
+    assert np.ptp(part.light) == pytest.approx(np.ptp(light), rel=1e-6)
+
+
+def test_the_camera_of_a_part_sees_what_the_frame_sees(monkeypatch):
+    """A ray through a part's pixel is the ray through the same pixel of the frame."""
+    monkeypatch.setattr(joint, 'BUDGET', 160 * 224 // 4)
+    light = blurred(TRUTH)
+    for part in joint._parts(light, DEPTH, CAMERA, 5.0):
+        left, top = CAMERA.cx - part.camera.cx, CAMERA.cy - part.camera.cy
+        assert left == round(left) and top == round(top)
+        rows, columns = part.light.shape
+        cut = light[round(top) : round(top) + rows, round(left) : round(left) + columns]
+        np.testing.assert_array_equal(part.light, cut)
+
+
+def test_disagreement_softens():
+    """Parts with one optimum are believed; parts that pull apart are not."""
+    bends = np.array([np.eye(6) * 1e4] * 4)
+    optimum = np.ones(6)
+    agree = -bends @ optimum
+    assert joint._softening(agree, bends) == joint.SOFTEST
+    apart = agree + 1e4 * np.array([[1.0], [-1], [1], [-1]])
+    assert joint._softening(apart, bends) > 100 * joint.SOFTEST
+
+
+def test_the_curvature_follows_a_quadratic():
+    """Symmetric rank one finds the curvature along each move, but stays within its bounds."""
+    rng = np.random.default_rng(0)
+    first = np.eye(6)
+    true = np.diag([0.5, 0.8, 0.9, 1.0, 1.1, 0.6])
+    bend = first
+    for _ in range(12):
+        move = rng.standard_normal(6)
+        bend = joint._bent(bend, first, move, true @ move)
+    np.testing.assert_allclose(bend, true, atol=1e-6)
+    wild = joint._bent(first, first, np.eye(6)[0], 50 * np.eye(6)[0])
+    assert np.linalg.eigvalsh(wild).max() <= joint.BENDS[1] + 1e-9

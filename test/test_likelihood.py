@@ -1,0 +1,115 @@
+"""The slope of the likelihood against dense algebra, and the scales against what was put in."""
+
+from depth_deblur_ros.core import likelihood
+from depth_deblur_ros.core.blur import blur_operator
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion
+from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+import numpy as np
+import oracle
+from pictures import texture
+import pytest
+
+TINY = CameraIntrinsics(40.0, 40.0, 15.5, 15.5, 32, 32, transfer='linear')
+TRUTH = np.array([0.0, 0.1, 0.03, 0.02, 0.0, 0.0])
+
+
+def part(camera, motion, seed=0, sigma=0.01, scene=0):
+    """Give a part of a picture that a motion blurs, with noise, before a slanted wall."""
+    shape = camera.height, camera.width
+    depth = np.float32(2 + 0.5 * np.indices(shape)[1] / shape[1])
+    blur = blur_operator(Motion.from_vector(motion), depth, camera)
+    high, wide, _ = blur.latent_shape
+    latent = np.repeat(texture(scene, (high, wide))[..., None], 3, 2).astype(np.float32)
+    noise = sigma * np.random.default_rng(5).standard_normal(shape)
+    light = np.float32(blur.apply(latent)[..., 0] + noise)
+    return Part(light, np.ones(shape, np.float32), depth, camera, seed)
+
+
+def dense(found):
+    """Give A, W, R [float64] of a posterior's quadratic, over the whole latent planes."""
+    sweep, problem = found.blur.sweep, found.problem
+    _, high, wide = sweep.latent_shape
+    width = found.part.light.shape[1]
+    columns = np.eye(high * wide, dtype=np.float32).reshape(-1, high, wide)
+    a, r = [], []
+    trust = problem.trust
+    for column in columns:
+        x = np.repeat(column[None], 3, 0)
+        a.append(sweep.gather(x, np.ones_like(trust))[0, :, :width].ravel())
+        none = np.zeros_like(trust)
+        r.append(-problem.slope(none, x)[0].ravel())
+    return np.array(a, np.float64).T, trust[0][:, :width].ravel().astype(np.float64), np.array(r)
+
+
+def minus_log_likelihood(p, one):
+    """Give - log of the likelihood of B with the prior's links held: L Gaussian, marginalised."""
+    found = posterior(one, p)
+    a, w, r = dense(found)
+    matrix = (a.T * w) @ a + r.astype(np.float64)
+    b = one.light.astype(np.float64).ravel()
+    best = np.linalg.solve(matrix + 1e-9 * np.eye(len(matrix)), a.T @ (w * b))
+    left = b - a @ best
+    energy = left @ (w * left) + best @ r @ best
+    determinant = np.linalg.slogdet(matrix + 1e-9 * np.eye(len(matrix)))[1]
+    return 0.5 * energy / one.scales.sigma**2 + 0.5 * determinant
+
+
+@pytest.fixture
+def converged(monkeypatch):
+    """Hold the links at the blurred picture, which no motion changes, and solve to the end."""
+    monkeypatch.setattr(likelihood, 'REWEIGHTINGS', 1)
+    monkeypatch.setattr(likelihood, 'STEPS', 250)
+
+
+@pytest.mark.slow
+def test_the_slope_is_that_of_the_marginal_likelihood(converged):
+    """Along a turn, by central differences of dense algebra; the samples average to the trace."""
+    p, step = 0.9 * TRUTH, 2e-4
+    along = np.array([0, 1.0, 0, 0, 0, 0])
+    one = part(TINY, TRUTH)
+    ahead, behind = (minus_log_likelihood(p + s * step * along, one) for s in (1, -1))
+    told = [slope_of(posterior(part(TINY, TRUTH, seed), p))[0] @ along for seed in range(0, 40)]
+    expected = (ahead - behind) / (2 * step)
+    error = 3 * np.std(told) / np.sqrt(len(told)) + 0.05 * abs(expected)
+    assert abs(np.mean(told) - expected) < error
+    assert error < 0.5 * abs(expected)
+
+
+def test_curvature_is_less_than_with_the_image_held():
+    """And never negative: part of what a motion changes, another image makes up for."""
+    found = posterior(part(TINY, TRUTH), TRUTH)
+    _, slope = slope_of(found)
+    weighted = found.part.trust[..., None] * slope
+    held = weighted.reshape(-1, 6).T @ slope.reshape(-1, 6) / found.part.scales.sigma**2
+    answered = curvature_of(found, slope)
+    assert np.linalg.eigvalsh(answered).min() > 0
+    assert (np.diag(answered) < np.diag(held)).all()
+
+
+@pytest.mark.parametrize('sigma', [0.004, 0.02])
+def test_noise_is_found(sigma):
+    camera = CameraIntrinsics(120.0, 120.0, 63.5, 63.5, 128, 128, transfer='linear')
+    motion = np.array([0.0, 0.06, 0, 0, 0, 0])
+    found = settled(part(camera, motion, sigma=sigma), motion)
+    assert 0.8 * sigma < found.scales.sigma < 1.25 * sigma
+
+
+def test_a_smoother_scene_has_more_prior():
+    """The same scene at a third of its contrast, and of its noise."""
+    camera = CameraIntrinsics(120.0, 120.0, 63.5, 63.5, 128, 128, transfer='linear')
+    motion = np.array([0.0, 0.06, 0, 0, 0, 0])
+    one = part(camera, motion, sigma=0.004)
+    faint = Part(one.light / 3, one.counts, one.depth, camera, 0)
+    assert settled(faint, motion).scales.prior > 1.2 * settled(one, motion).scales.prior
+
+
+def test_the_adjoint_of_the_test_is_the_operator(converged):
+    """The dense A of these tests agrees with the slow twin."""
+    found = posterior(part(TINY, TRUTH), TRUTH)
+    a, _, _ = dense(found)
+    matrix = oracle.blur_matrix(found.blur)
+    inner = np.random.default_rng(0).random(matrix.shape[1])
+    planes = np.zeros(found.blur.sweep.latent_shape)
+    high, wide, _ = found.blur.latent_shape
+    found.blur.latent_part(planes)[0] = inner.reshape(high, wide)
+    np.testing.assert_allclose(a @ planes[0].ravel(), matrix @ inner, atol=1e-4)
