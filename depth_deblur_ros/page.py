@@ -82,7 +82,8 @@ def _frames(run: Run) -> Iterator[str]:
 
 def _card(number: int, note: Note, shot: Shot, total: int) -> Iterator[str]:
     outcome = note.outcome.value
-    after = 'sharp' if note.outcome is Outcome.SOLVED else 'unchanged'
+    same = shot.pictures['sharp'] == shot.pictures['blurred']  # not solved, or mode motion
+    after = 'unchanged' if same else 'sharp'
     stamp = f'stamp {note.stamp_ns // 10**9}.{note.stamp_ns % 10**9:09d}'
     yield f'<article class="card" id="frame-{number}"><h3>Frame {number + 1} of {total}'
     yield f'<span class="badge {outcome}">{outcome}</span></h3>'

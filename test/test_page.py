@@ -59,7 +59,7 @@ def run_of(outcomes, **more):
     notes, shots = [], []
     for k, outcome in enumerate(outcomes):
         result = result_of(k, outcome, energies=STEPS if k == 0 else ())
-        frame = RgbdFrame(result.image, result.depth, CAMERA, 0.02, 10**18 + 33_333_333 * k)
+        frame = RgbdFrame(1 - result.image, result.depth, CAMERA, 0.02, 10**18 + 33_333_333 * k)
         notes.append(note_of(frame.stamp_ns, 0.02, result))
         shots.append(shot_of(frame, result))
     return Run('a <bag> & more', notes, shots, **more)
@@ -141,6 +141,17 @@ def test_a_single_picture_has_no_time_to_draw_over():
     page = run_page(run_of([Outcome.SHARP]))
     ids = [a['id'] for _, a in Elements(page).tags if 'id' in a]
     assert ids == ['frames', 'frame-0', 'energy', 'losses']
+
+
+def test_what_was_left_as_it_was_is_not_called_sharp():
+    run = run_of([Outcome.SOLVED])
+    same = {**run.shots[0].pictures, 'sharp': run.shots[0].pictures['blurred']}
+    left = replace(run, shots=[replace(run.shots[0], pictures=same)])
+    captions = [
+        re.findall(r'<figcaption><span>blurred</span><span>(\w+)', run_page(r))
+        for r in (run, left)
+    ]
+    assert captions == [['sharp'], ['unchanged']]
 
 
 def test_a_run_of_no_frames_is_a_page_too():
