@@ -47,9 +47,11 @@ def solver_flags(parser: Parser) -> None:
     group.add_argument('--params', type=Path, metavar='FILE', help='YAML, as ROS takes it')
     for knob in knobs():
         meta = knob.metadata
-        limits = (
-            '|'.join(meta['choices']) if 'choices' in meta else f'{meta["low"]}..{meta["high"]}'
-        )
+        limits = 'TEXT'
+        if 'choices' in meta:
+            limits = '|'.join(meta['choices'])
+        elif 'low' in meta:
+            limits = f'{meta["low"]}..{meta["high"]}'
         group.add_argument(
             '--' + knob.name.replace('_', '-'),
             type=type(knob.default),

@@ -44,7 +44,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_policy_name_from_kind, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import Float32
 
 NAME = 'depth_deblur'
@@ -58,7 +58,7 @@ PATIENCE_S = 0.5  # for the frame that is being solved at the end
 _CLASSES: dict[str, Any] = {
     f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}': kind
     for kind in (
-        *(CameraInfo, CompressedImage, DiagnosticStatus, Float32, Image),
+        *(CameraInfo, CompressedImage, DiagnosticStatus, Float32, Image, Imu),
         *(TwistStamped, TwistWithCovarianceStamped),
     )
 }

@@ -75,6 +75,8 @@ class Pipeline:
                 self._intake.push_colour(msg, came_ns)
             elif role == 'depth':
                 self._intake.push_depth(msg)
+            elif role == 'imu':
+                self._tracker.gyro.take(msg)
             elif role == 'camera_info':
                 self._intake.infos.push(msg)
             else:

@@ -20,6 +20,7 @@ _ROLES = {  # role: (message types, usual topics)
     'depth': (_IMAGES, ('/depth_registered/image_rect', '/camera/depth/image')),
     'info': (('sensor_msgs/msg/CameraInfo',), ('/rgb/camera_info', '/camera/rgb/camera_info')),
     'exposure': (('std_msgs/msg/Float32',), ('/exposure', '/camera/rgb/exposure')),
+    'imu': (('sensor_msgs/msg/Imu',), ('/imu', '/imu/data', '/camera/imu')),
 }
 _TRANSPORTS = ('', '/compressed', '/compressedDepth')
 _DEPTH_ENCODINGS = ('16UC1', '32FC1')
@@ -27,16 +28,18 @@ _DEPTH_ENCODINGS = ('16UC1', '32FC1')
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics that are read; info is None where a camera is given, exposure is optional."""
+    """The topics that are read; info is None where a camera is given, the last are optional."""
 
     colour: str
     depth: str
     info: str | None
     exposure: str | None
+    imu: str | None = None
 
     def names(self) -> set[str]:
         """Give all that are read."""
-        return {name for name in (self.colour, self.depth, self.info, self.exposure) if name}
+        names = (self.colour, self.depth, self.info, self.exposure, self.imu)
+        return {name for name in names if name}
 
 
 def choose_topics(bag: BagReader, given: Mapping[str, str], *, with_info: bool) -> Topics:
@@ -52,7 +55,8 @@ def choose_topics(bag: BagReader, given: Mapping[str, str], *, with_info: bool) 
     if with_info:
         beside = colour.removesuffix('/compressed').rpartition('/')[0] + '/camera_info'
         info = given.get('info') or _usual(bag, 'info', beside) or _only(bag, 'info')
-    return Topics(colour, depth, info, given.get('exposure') or _usual(bag, 'exposure'))
+    optional = [given.get(role) or _usual(bag, role) for role in ('exposure', 'imu')]
+    return Topics(colour, depth, info, *optional)
 
 
 def first_message(bag: BagReader, topic: str) -> Any:
@@ -117,8 +121,8 @@ class PairReader:
     """
     Read the colour-depth pairs of a bag; `dropped` counts what found no pair, by reason.
 
-    on_message, where given, sees every message of the bag in passing. The camera_info is the
-    latest before the colour frame; before the first, the first.
+    on_message, where given, sees every message of the bag in passing, on_imu those of the gyro.
+    The camera_info is the latest before the colour frame; before the first, the first.
     """
 
     def __init__(
@@ -127,11 +131,13 @@ class PairReader:
         topics: Topics,
         slop_ns: int,
         on_message: Callable[[BagMessage], None] | None = None,
+        *,
+        on_imu: Callable[[Any], None] | None = None,
     ) -> None:
         self.slop_s = slop_ns / 1e9
         self._bag = bag
         self._topics = topics
-        self._on_message = on_message
+        self._on_message, self._on_imu = on_message, on_imu
         self._pairer: StampPairer[Pair, Any] = StampPairer(slop_ns)
         self._info = first_camera(bag, topics.info) if topics.info else None
         self._exposure: float | None = None
@@ -164,6 +170,9 @@ class PairReader:
             self._info = content
         elif name == self._topics.exposure:
             self._exposure = float(content.data)
+        elif name == self._topics.imu:
+            if self._on_imu:
+                self._on_imu(content)
         elif name == self._topics.depth:
             yield from map(_joined, self._pairer.push_depth(stamp_ns(content.header), content))
         else:

@@ -114,9 +114,11 @@ def replay(
             target.inside(journal.folder) as writer,
         ):
             copy = _copier(writer) if all_topics else None
-            pairs = PairReader(reader, names, round(sync_slop_s * 1e9), copy)
+            tracker = Tracker(solve)
+            slop_ns = round(sync_slop_s * 1e9)
+            pairs = PairReader(reader, names, slop_ns, copy, on_imu=tracker.gyro.take)
             summary = ReplaySummary(dropped=pairs.dropped)
-            work = _Work(writer, journal, Tracker(solve), params, given, on_frame)
+            work = _Work(writer, journal, tracker, params, given, on_frame)
             for pair, following in _with_next(pairs.pairs(*span)):
                 done = work.finish(pair, following)
                 summary.count(done.record['outcome'], done.reason)

@@ -32,6 +32,7 @@ class NodeParams:
     )
     camera_info_topic: str = free('rgb/camera_info', 'the colour camera' + _RESUBSCRIBE)
     exposure_topic: str = free('exposure', 'exposure times, seconds' + _RESUBSCRIBE)
+    imu_topic: str = free('imu', 'gyro readings' + _RESUBSCRIBE)
     colour_transport: str = choice(
         'raw', ('raw', 'compressed'), 'compressed: read <colour_topic>/compressed'
     )
@@ -54,7 +55,13 @@ class NodeParams:
 
     def __post_init__(self) -> None:
         check_values(self)
-        for name in ('colour_topic', 'depth_topic', 'camera_info_topic', 'exposure_topic'):
+        for name in (
+            'colour_topic',
+            'depth_topic',
+            'camera_info_topic',
+            'exposure_topic',
+            'imu_topic',
+        ):
             if not _TOPIC.fullmatch(getattr(self, name)):
                 raise InputError(f'{name} must be a topic name, got {getattr(self, name)!r}')
 
@@ -87,6 +94,7 @@ class Settings:
                 node.camera_info_topic, 'sensor_msgs/msg/CameraInfo', not self.given.camera
             ),
             'exposure': Source(node.exposure_topic, 'std_msgs/msg/Float32', False),
+            'imu': Source(node.imu_topic, 'sensor_msgs/msg/Imu', False),
         }
 
 

@@ -23,7 +23,8 @@ from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
 from depth_deblur_ros.glide import unknown_glide
-from depth_deblur_ros.joining import Context, join
+from depth_deblur_ros.gyro import Gyro
+from depth_deblur_ros.joining import Context, GUESS, join
 from depth_deblur_ros.shutter import Exposure, Shutter
 import numpy as np
 
@@ -76,6 +77,7 @@ class Tracker:
 
     def __init__(self, solve: Solver = deblur) -> None:
         self._solve = solve
+        self.gyro = Gyro()
         self._glide = unknown_glide()
         self._shutter = Shutter()
         self._last: Seen | None = None
@@ -84,13 +86,15 @@ class Tracker:
 
     def state(self) -> Any:
         """Give all that is remembered, as something that can be pickled."""
-        own = (self._glide, self._shutter, self._last, self._ahead, list(self._intervals))
+        frames = (self._last, self._ahead, list(self._intervals))
+        own = (self._glide, self._shutter, frames, self.gyro.trial)
         return own, self._solve.state() if isinstance(self._solve, Memory) else None
 
     def restore(self, state: Any) -> None:
         """Remember this, and nothing else."""
         own, inner = state
-        self._glide, self._shutter, self._last, self._ahead, intervals = own
+        self._glide, self._shutter, frames, self.gyro.trial = own
+        self._last, self._ahead, intervals = frames
         self._intervals = deque(intervals, maxlen=REMEMBERED)
         if isinstance(self._solve, Memory):
             self._solve.restore(inner)
@@ -107,7 +111,7 @@ class Tracker:
         if params.neighbours == 'ignore':
             return Tracked(self._solve(frame, params), told)
         began = time.monotonic()
-        context = self._context(frame, following, told)
+        context = self._context(frame, following, told, params)
         spent = time.monotonic() - began
         alone = self._alone(frame, params, context.expected())
         joined = join(alone, context, frame.camera)
@@ -118,19 +122,33 @@ class Tracker:
         return Tracked(replace(result, seconds=result.seconds + spent), joined.exposure)
 
     def _context(
-        self, frame: RgbdFrame, following: RgbdFrame | None, told: Exposure | None
+        self,
+        frame: RgbdFrame,
+        following: RgbdFrame | None,
+        told: Exposure | None,
+        params: SolverParams,
     ) -> Context:
-        """Go on to a frame, look at the following one."""
-        seen = self._arrive(frame)
+        """Go on to a frame, look at the following one, ask the gyro."""
+        seen = self._arrive(frame, params)
         glide, known = self._glide, seen.way is not None
         self._ahead = self._seen(following, seen) if following else None
         if self._ahead and self._ahead.way and self._ahead.seconds:
             way = self._uneven(self._ahead.way, self._ahead.seconds)
             glide = glide.before(self._ahead.seconds, way.motion, way.covariance)
             known = True
-        return Context(glide, self._shutter, told, self._interval(), known)
+        context = Context(glide, self._shutter, told, self._interval(), known)
+        return self._turned(frame.stamp_ns, context, params)
 
-    def _arrive(self, frame: RgbdFrame) -> Seen:
+    def _turned(self, stamp_ns: int, context: Context, params: SolverParams) -> Context:
+        """Let the gyro tell the turn over the exposure."""
+        seconds = context.exposure.seconds if context.exposure else GUESS * context.interval
+        turn = self.gyro.measured(stamp_ns, seconds, params)
+        if turn is None:
+            return context
+        self._glide = self._glide.measured(*turn)
+        return replace(context, glide=context.glide.measured(*turn), seen=True)
+
+    def _arrive(self, frame: RgbdFrame, params: SolverParams) -> Seen:
         """Take a frame in: the velocity is then that at its stamp."""
         seen = self._ahead
         if seen is None or seen.stamp_ns != frame.stamp_ns:
@@ -147,6 +165,8 @@ class Tracker:
             self._glide = self._glide.moved(seen.seconds, way.motion, way.covariance)
         else:
             self._glide = self._glide.moved(seen.seconds, None, None)
+        first_ns = frame.stamp_ns - round(1e9 * seen.seconds)
+        self.gyro.compare(first_ns, seen.way, seen.seconds, params)
         return seen
 
     def _seen(self, frame: RgbdFrame, before: Seen | None) -> Seen:

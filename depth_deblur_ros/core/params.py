@@ -40,6 +40,14 @@ class SolverParams:
         ('heed', 'ignore'),
         'heed: the frames around one tell its sign and exposure; ignore: each frame alone',
     )
+    gyro_rotation: str = free(
+        '0 0 0 1', "from the gyro's axes to the camera's, as a quaternion x y z w"
+    )
+    gyro_noise: float = knob(0.01, 0.0, 1.0, 'of a reading of the gyro, at least [rad/s]')
+    gyro_bias: float = knob(0.05, 0.0, 10.0, 'of the gyro, standard deviation [rad/s]')
+    gyro_delay_s: float = knob(
+        0.0, -1.0, 1.0, "how far the gyro's stamps are behind the camera's, mid-exposure [s]"
+    )
     threads: int = knob(2, 1, 256, 'threads of the compiled kernels')
     prior: float = knob(2.7, 0.01, 100.0, 'weight of the image prior: more is smoother [c]')
     reweightings: int = knob(3, 1, 20, 'quadratic problems that the image step solves')
