@@ -12,7 +12,7 @@ SECONDS = float(os.environ.get('STUB_SECONDS', '0.02'))
 THETA, V = (0.01, -0.02, 0.03), (0.004, 0.0, -0.008)
 
 
-def solve(frame, params):
+def solve(frame, params, *, start=None):
     time.sleep(SECONDS)
     if frame.image.max() == 0:
         raise ZeroDivisionError('a black frame')
