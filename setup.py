@@ -52,6 +52,7 @@ setup(
             f'ros-jazzy-rclpy[fastrtps]==7.1.6{ON_X86_LINUX}',
             f'ros-jazzy-common-interfaces==5.3.6{ON_X86_LINUX}',
         ],
+        'fuzz': ["atheris>=3.0; sys_platform == 'linux'"],
         'bench': ['scikit-image>=0.22'],
         'test': [
             'setuptools>=71',

@@ -75,11 +75,13 @@ class BagReader:
         """What could not be read so far, and where; how many messages, when all has been read."""
         notes = [*self._missing, *(note for file in self._files for note in file.damage)]
         given = sum(sum(file.given.values()) for file in self._files)
-        if not notes or sum(len(file.given) for file in self._files) < len(self._blocks):
+        if sum(len(file.given) for file in self._files) < len(self._blocks):
             return notes
         stated = [file.stated for file in self._files]
         known = [count for count in stated if count is not None]
         total = self._stated if self._missing or len(known) < len(stated) else sum(known)
+        if not notes and given >= (total or 0):
+            return notes
         if total is None:
             return [*notes, f'{given} messages read; nothing tells how many are lost']
         return [*notes, f'{max(0, total - given)} of {total} messages lost']
@@ -214,8 +216,10 @@ class BagWriter:
             storage.bio.flush()
 
     def copy(self, message: BagMessage) -> None:
-        """Append a message of another bag as it is."""
+        """Append a message of another bag as it is, unless its type has been lost."""
         topic = message.topic
+        if not topic.type:
+            return
         if topic.name not in self._connections:
             self._connections[topic.name] = self._writer.add_connection(
                 topic.name,

@@ -26,10 +26,11 @@ _Read = Callable[[int], bytes]
 
 
 class Unpacked(NamedTuple):
-    """The records in a chunk; trouble says what is wrong with them, if anything is."""
+    """The records in a chunk; trouble says what is wrong; whole: they have their full length."""
 
     content: bytes
     trouble: str
+    whole: bool
 
 
 def unpack(chunk: bytes, cut: bool) -> Unpacked:
@@ -40,19 +41,19 @@ def unpack(chunk: bytes, cut: bool) -> Unpacked:
     form = chunk[at + 4 : at + 4 + named].decode('ascii', errors='replace')
     packed = chunk[at + 4 + named + 8 :]
     if form not in _UNPACKERS:
-        return Unpacked(b'', f'its compression {form!r} is not known')
+        return Unpacked(b'', f'its compression {form!r} is not known', False)
     unpacker = _UNPACKERS[form]
     content = _drained(unpacker, packed) if unpacker else packed
     if checksum == 0 and len(content) == size:
-        return Unpacked(content, '')
+        return Unpacked(content, '', True)
     if zlib.crc32(content) == checksum:
-        return Unpacked(content, '')
+        return Unpacked(content, '', True)
     if cut or len(content) < size:
-        return Unpacked(content, f'only {len(content)} of its {size} bytes can be unpacked')
+        return Unpacked(content, f'only {len(content)} of its {size} bytes can be unpacked', False)
     short = len(content) <= _MAX_REPAIR
     if not form and short and (repaired := _with_bit_turned_back(content, checksum)):
-        return Unpacked(repaired, 'one flipped bit has been turned back')
-    return Unpacked(content, 'its checksum is wrong, so that messages may be altered')
+        return Unpacked(repaired, 'one flipped bit has been turned back', True)
+    return Unpacked(content, 'its checksum is wrong, so that messages may be altered', True)
 
 
 def unpack_message(data: bytes) -> bytes:

@@ -27,6 +27,7 @@ from depth_deblur_ros.mcap_records import (
     FOOTER,
     Gap,
     HEAD,
+    is_cdr,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
@@ -48,7 +49,7 @@ _DAMAGE = (McapError, ValueError, struct.error, MemoryError, OSError)
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: what another bag needs to hold it too."""
+    """A topic of a bag: what another bag needs to hold it too; an empty type has been lost."""
 
     name: str
     type: str
@@ -82,9 +83,7 @@ class _Reading:
     troubles: Counter[str] = field(default_factory=Counter)
 
     def __str__(self) -> str:
-        return '; '.join(
-            text if count == 1 else f'{count} x {text}' for text, count in self.troubles.items()
-        )
+        return '; '.join(f'{n} x {text}' if n > 1 else text for text, n in self.troubles.items())
 
 
 class McapFile:
@@ -92,8 +91,7 @@ class McapFile:
     The blocks and topics of one file; what cannot be read is left out and noted in `damage`.
 
     `stated` is how many messages the file says it holds, None where it does not say so; `given`
-    how many each block gave that has been read; `lost` how many an index tells of that lie in no
-    block.
+    how many each block gave that has been read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,12 +99,13 @@ class McapFile:
         self.blocks: list[Block] = []
         self.topics: dict[int, Topic] = {}
         self.damage: list[str] = []
+        self._doubted: dict[int, Topic] = {}
         self.stated: int | None = None
         self.given: dict[Record, int] = {}
-        self.lost = 0
         self._schemas: dict[int, Schema] = {}
         self._indexed: Counter[int] = Counter()  # what an index that comes now tells of
-        self._whole = False  # whether the footer has been seen
+        self._summary = 0  # where it begins, when the end of the data has been seen
+        self._whole = False  # the footer has been seen
         self._stream = self._opened(path)
         try:
             self._scan()
@@ -147,13 +146,15 @@ class McapFile:
         for gap, counts in gaps:
             lost = f', which held {counts.total()} messages' if counts else ''
             self._note(f'no record can be read from byte {gap.begin} to {gap.end}{lost}')
-            self.lost += counts.total()
         if not self._whole:
             self._note(f'ends at byte {size} without a footer: it was cut or never finished')
+        elif not self._summary:
+            self._note('the end of its data is missing')
         if self.damage or not self.topics:  # what the summary tells stands in the chunks too
             for block in self.blocks:
                 for _ in self._contents(block.record, _Reading()):
                     pass
+        self.topics = self.topics or self._doubted
 
     def _list_all(self, size: int) -> list[tuple[Gap, Counter[int]]]:
         """List the blocks; give the gaps between them with what an index says was there."""
@@ -179,8 +180,11 @@ class McapFile:
             self._indexed = Counter()
             self.blocks.append(Block(start, end, record, self._indexed))
         elif record.opcode == MESSAGE and not record.cut:
-            head = self._bytes(record, MESSAGE_HEAD.size)
-            channel, _, time, _ = MESSAGE_HEAD.unpack(head)
+            channel, _, time, _ = MESSAGE_HEAD.unpack(self._bytes(record, MESSAGE_HEAD.size))
+            chunked = bool(self.blocks) and self.blocks[-1].record.opcode == CHUNK
+            if chunked and not is_cdr(self._stream, record.offset):
+                self._note(f'the record at byte {record.offset} is no message')
+                return
             self.blocks.append(Block(time, time, record, Counter({channel: 1})))
             self._indexed = Counter()
         elif record.opcode == MESSAGE_INDEX:
@@ -190,20 +194,32 @@ class McapFile:
         elif record.opcode == STATISTICS:
             self._count(self._bytes(record))
         elif record.opcode == DATA_END:
+            self._summary = record.end
             self._check(record)
         elif record.opcode == FOOTER:
             self._whole = True
+            self._check_summary(record)
 
     def _check(self, end: Record) -> None:
         """Check messages outside of chunks: the file's checksum is their only one."""
-        checksum = int.from_bytes(self._bytes(end), 'little')
-        if checksum and any(block.record.opcode == MESSAGE for block in self.blocks):
-            self._stream.seek(0)
-            found, left = 0, end.offset - HEAD.size
-            while left and (piece := self._stream.read(min(left, _PIECE))):
-                found, left = zlib.crc32(piece, found), left - len(piece)
-            if found != checksum:
-                self._note('the checksum of its data is wrong, so that messages may be altered')
+        told = int.from_bytes(self._bytes(end), 'little')
+        bare = any(block.record.opcode == MESSAGE for block in self.blocks)
+        if told and bare and self._checksum(0, end.offset - HEAD.size) != told:
+            self._note('the checksum of its data is wrong, so that messages may be altered')
+
+    def _check_summary(self, footer: Record) -> None:
+        """Check what has been learned last: it counts less than what stands in the data."""
+        told = int.from_bytes(self._bytes(footer)[-4:], 'little')
+        if told and self._summary and self._checksum(self._summary, footer.end - 4) != told:
+            self._note('the checksum of its summary is wrong')
+            self._doubted, self.topics, self.stated = self.topics, {}, None
+
+    def _checksum(self, begin: int, end: int) -> int:
+        self._stream.seek(begin)
+        value, left = 0, end - begin
+        while left > 0 and (piece := self._stream.read(min(left, _PIECE))):
+            value, left = zlib.crc32(piece, value), left - len(piece)
+        return value
 
     def _index(self, data: bytes) -> None:
         """Take in how many messages of a channel the last chunk or gap holds, and their times."""
@@ -232,14 +248,14 @@ class McapFile:
         if record.opcode != CHUNK:
             yield record.opcode, data
             return
-        content, trouble = unpack(data, record.cut)
+        content, trouble, whole = unpack(data, record.cut)
         if trouble:
             reading.troubles[trouble] += 1
         stream = BytesIO(content)
         for found in walk(stream, 0, len(content)):
             if isinstance(found, Gap):
                 reading.troubles[f'{found.end - found.begin} of its bytes hold no record'] += 1
-            elif not found.cut:
+            elif whole or not found.cut:
                 inside = content[found.offset : found.end]
                 if found.opcode in (SCHEMA, CHANNEL):
                     self._learn(found.opcode, inside)
@@ -260,11 +276,16 @@ class McapFile:
         except _DAMAGE as error:
             self._note(f'a description of a topic cannot be read: {error!r}')
             return
-        if described := self._schemas.get(channel.schema_id):
-            text = described.data.decode(errors='replace')
-            self.topics[channel.id] = Topic(
-                channel.topic, described.name, text, channel.message_encoding, channel.metadata
-            )
+        described = self._schemas.get(channel.schema_id)
+        if channel.id in self.topics and not described:
+            return
+        self.topics[channel.id] = Topic(
+            channel.topic,
+            described.name if described else '',  # lost: what it is can be told from elsewhere
+            described.data.decode(errors='replace') if described else '',
+            channel.message_encoding,
+            channel.metadata,
+        )
 
     def _message(self, data: bytes, reading: _Reading) -> BagMessage | None:
         channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data)
@@ -301,12 +322,9 @@ class McapFile:
         try:
             with path.open('rb') as packed:
                 zstandard.ZstdDecompressor().copy_stream(packed, plain)
-        except zstandard.ZstdError as error:
-            if not plain.tell():
+        except (OSError, zstandard.ZstdError) as error:
+            if isinstance(error, OSError) or not plain.tell():
                 plain.close()
                 raise
             self._note(f'cannot be unpacked behind byte {plain.tell()}: {error}')
-        except BaseException:
-            plain.close()
-            raise
         return plain

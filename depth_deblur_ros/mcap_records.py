@@ -34,14 +34,8 @@ _FIELDS = {  # opcode: (bytes before, fields that begin with their length, bytes
     DATA_END: (4, 0, 0),
 }
 _LEAST = {MESSAGE: MESSAGE_HEAD.size, 0x08: 60, 0x09: 32}  # bytes of those that tell less
-_SOUGHT = (
-    SCHEMA,
-    CHANNEL,
-    MESSAGE,
-    CHUNK,
-    MESSAGE_INDEX,
-    DATA_END,
-)  # what is worth finding behind damage
+_SURE = (SCHEMA, CHANNEL, CHUNK, MESSAGE_INDEX, DATA_END)  # chance hardly makes one of these
+_SOUGHT = (*_SURE, MESSAGE)  # worth finding behind damage
 _CDR = re.compile(rb'\0[\0-\x0d]|\x28\xb5\x2f\xfd')  # how the content of a ROS message begins
 _HEADS = re.compile(rb'(?=[\x03-\x0f].{5}\0\0\0)', re.DOTALL)  # of records below 2^40 bytes
 _WINDOW = 1 << 22
@@ -104,7 +98,8 @@ def _record_at(stream: BinaryIO, at: int, size: int) -> Record | None:
     offset = at + HEAD.size
     if opcode == CHUNK:
         return _chunk_at(stream, offset, length, size)
-    if opcode == MESSAGE and length > size - offset and _begins(stream, at, size):
+    believed = MESSAGE_HEAD.size <= length <= size - offset
+    if opcode == MESSAGE and not believed and is_cdr(stream, offset):
         return Record(MESSAGE, offset, size - offset, cut=True)
     if opcode == 0 or length > size - offset:
         return None
@@ -120,7 +115,7 @@ def _record_at(stream: BinaryIO, at: int, size: int) -> Record | None:
 def _chunk_at(stream: BinaryIO, offset: int, length: int, size: int) -> Record | None:
     """Give a chunk, which tells its length twice; either may be the damaged one."""
     head = _read(stream, offset, CHUNK_HEAD.size + 4 + 4 + 8)
-    if len(head) < CHUNK_HEAD.size + 4 + 8:
+    if len(head) < CHUNK_HEAD.size + 4 + 4 + 8:
         return None
     named = int.from_bytes(head[CHUNK_HEAD.size :][:4], 'little')
     before = CHUNK_HEAD.size + 4 + named
@@ -128,7 +123,7 @@ def _chunk_at(stream: BinaryIO, offset: int, length: int, size: int) -> Record |
     if told == length:
         return Record(CHUNK, offset, min(length, size - offset), cut=length > size - offset)
     for likely in (length, told):
-        if 0 < likely < size - offset and _begins(stream, offset + likely, size):
+        if len(head) <= likely < size - offset and _begins(stream, offset + likely, size):
             return Record(CHUNK, offset, likely, mended=True)
     return None
 
@@ -159,9 +154,13 @@ def _begins(stream: BinaryIO, at: int, size: int) -> bool:
         told = int.from_bytes(_read(stream, at_told, 8), 'little')
         return named in (0, 3, 4) and CHUNK_HEAD.size + 12 + named + told == length
     if opcode == MESSAGE:
-        payload = _read(stream, offset + MESSAGE_HEAD.size, 4)
-        return length >= MESSAGE_HEAD.size and _CDR.match(payload) is not None
+        return length >= MESSAGE_HEAD.size and is_cdr(stream, offset)
     return opcode in _LEAST and _LEAST[opcode] <= length <= size - offset
+
+
+def is_cdr(stream: BinaryIO, offset: int) -> bool:
+    """Whether a message record with this content holds a ROS message."""
+    return _CDR.match(_read(stream, offset + MESSAGE_HEAD.size, 4)) is not None
 
 
 def _goes_on(stream: BinaryIO, at: int, size: int) -> bool:
@@ -169,13 +168,15 @@ def _goes_on(stream: BinaryIO, at: int, size: int) -> bool:
     return at == size or _read(stream, at, 8) == MAGIC or _begins(stream, at, size)
 
 
-def _search(stream: BinaryIO, begin: int, stop: int, size: int) -> int:
+def _search(
+    stream: BinaryIO, begin: int, stop: int, size: int, sought: tuple[int, ...] = _SOUGHT
+) -> int:
     """Give where the next record begins; stop where there is none before."""
     for start in range(begin, stop, _WINDOW):
         window = _read(stream, start, min(_WINDOW, stop - start) + HEAD.size - 1)
         for match in _HEADS.finditer(window):
             at = start + match.start()
-            if window[match.start()] in _SOUGHT and _is_found(stream, at, size):
+            if window[match.start()] in sought and _is_found(stream, at, size):
                 return at
         magic = window.find(MAGIC)
         if 0 <= magic < stop - start:
@@ -187,6 +188,10 @@ def _is_found(stream: BinaryIO, at: int, size: int) -> bool:
     if not _begins(stream, at, size):
         return False
     record = _record_at(stream, at, size)
-    if record is None:
+    if record is None or (record.cut and record.opcode != CHUNK):
         return False
-    return record.opcode == CHUNK if record.cut else _goes_on(stream, record.end, size)
+    if record.opcode == MESSAGE:  # chance may make one that covers records of kinds that tell more
+        inside = record.offset + MESSAGE_HEAD.size
+        if _search(stream, inside, record.end, size, _SURE) < record.end:
+            return False
+    return record.cut or _goes_on(stream, record.end, size)

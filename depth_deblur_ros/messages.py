@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, MAX_PIXELS
+from depth_deblur_ros.picture import check_picture
 import numpy as np
 import numpy.typing as npt
 
@@ -211,6 +212,7 @@ def _metres(raw: npt.NDArray[Any]) -> FloatImage:
 
 def _decoded(msg: Any, data: npt.NDArray[np.uint8]) -> npt.NDArray[Any]:
     """Decode the bytes of a picture file, which OpenCV gives in the order BGR."""
+    check_picture(data.tobytes())
     try:
         raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:

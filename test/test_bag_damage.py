@@ -63,7 +63,7 @@ def assert_no_reader_finds_more(path, whole):
         ours, damage = raw(path)
     except InputError as error:
         ours, damage = [], [str(error)]
-    assert len(ours) <= len(whole)
+    assert len(sound(ours, whole)) == len([m for m in ours if m in whole])  # none twice
     assert sorted(ours) == sorted(whole) or damage
     for name, found in others(path).items():
         missed = set(sound(found, whole)) - set(ours)
@@ -88,8 +88,9 @@ def test_a_cut_bag_gives_what_any_reader_finds(folder, layout, part):
 @given(layout=layouts, flips=st.lists(st.tuples(parts, st.integers(0, 7)), min_size=1, max_size=4))
 def test_flipped_bits_cost_no_more_than_with_any_reader(folder, layout, flips):
     content = bytearray((folder / layout).read_bytes())
+    begin = 400 if layout == 'no index' else 0  # there topic and type are told only once
     for part, bit in flips:
-        content[min(int(part * len(content)), len(content) - 1)] ^= 1 << bit
+        content[begin + int(part * (len(content) - begin - 1))] ^= 1 << bit
     with suppress(UnicodeDecodeError):
         assert_no_reader_finds_more(damaged(folder, content), WHOLE)
 
@@ -279,7 +280,7 @@ def test_a_chunk_that_claims_to_be_huge_takes_no_memory(folder):
     content[chunk : chunk + 9 + length] = chunk_record
     found, damage = raw(damaged(folder, content))
     assert len(found) < COUNT
-    assert f'of its {2**60} bytes can be unpacked' in damage[0]
+    assert any(f'of its {2**60} bytes can be unpacked' in note for note in damage)
 
 
 def test_the_oracle_of_checksums_agrees(folder):
@@ -296,3 +297,17 @@ def test_garbage_never_crashes_the_reader(folder, seed):
         content[at : at + length] = rng.randbytes(rng.choice([length, 0, 2 * length]))
     with suppress(InputError), BagReader(damaged(folder, content)) as bag:
         assert len(list(bag.messages(bag.topics))) <= COUNT
+
+
+def test_a_chunk_that_claims_to_be_shorter_than_its_head_is_no_chunk(folder):
+    content = bytearray((folder / 'plain').read_bytes())
+    chunk = next(m.start() for m in re.finditer(rb'\x06.{5}\0\0\0', content, re.DOTALL))
+    index = content.index(b'\x07', chunk + 60)  # some record that begins where it says it ends
+    while struct.unpack_from('<Q', content, index + 1)[0] != 6 + 16 * content[index + 11] // 16:
+        index = content.index(b'\x07', index + 1)
+    record = bytes(content[index : index + 9 + 6 + content[index + 11]])
+    content[chunk + 1 : chunk + 9] = struct.pack('<Q', 22)
+    content[chunk + 9 + 22 : chunk + 9 + 22 + len(record)] = record
+    found, damage = raw(damaged(folder, content))
+    assert found
+    assert damage
