@@ -119,7 +119,8 @@ def test_every_frame_comes_back_as_it_was_told(tmp_path):
     ]
     first = run.notes[0]
     assert (first.outcome, first.sign_resolved, first.exposure) == (Outcome.SOLVED, True, EXPOSURE)
-    assert (first.quality, first.blur_px, first.seconds) == (0.75, 4.0, 0.5)
+    assert (first.quality, first.blur_px) == (0.75, 4.0)
+    assert first.seconds == pytest.approx(0.5, abs=0.3)  # following the camera takes some, too
     np.testing.assert_allclose(first.twist, VELOCITY)
     np.testing.assert_allclose(run.notes[1].twist, -VELOCITY)
     for k in (0, 1):  # the covariance of an open sign spans both signs: that is taken off again
