@@ -27,7 +27,7 @@ ROUNDS = 12
 FINEST = 0.2  # px; no track is better than this
 CUT = 4.0  # standard deviations; what is farther off does not count
 FEWEST, LEAST_SHARE = 20, 0.4  # of the tracks must agree
-OPTIMISM = 18.0  # errors of neighbouring tracks are alike, and those of depth stay: times variance
+OPTIMISM = 9.0  # times variance: errors of tracks are alike, the more so the larger they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,4 +131,5 @@ def _fit(j: Vector, flow: Vector) -> Between | None:
     agree = weight > 0
     if agree.sum() < FEWEST or agree.mean() < LEAST_SHARE:
         return None
-    return Between(p, OPTIMISM * spread**2 * np.linalg.inv(information + ridge))
+    doubt = OPTIMISM * (spread / FINEST) * spread**2
+    return Between(p, doubt * np.linalg.inv(information + ridge))
