@@ -129,7 +129,8 @@ def blur_operator(
     ray, packed = pack(motion, camera)
     flow = flow_parts(ray, packed, depth.shape)
     longest = math.sqrt(_largest(nearness_of(depth)[:, None], flow)[2])
-    samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), MIN_SAMPLES, MAX_SAMPLES))
+    least = math.ceil(MIN_SAMPLES / spacing)
+    samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), least, MAX_SAMPLES))
     seen = seen_inverse_depth(motion, depth, camera, samples)
     reach = max(_largest(np.moveaxis(seen, 2, 1), flow)[:2]) / 2
     margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: interpolation
