@@ -28,7 +28,10 @@ SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 MOVES = 4
 LONGEST_MOVE, LEAST_MOVE = 1.0, 0.02  # px
-SOFTEST, DISSENT = 10.0, 4.0  # what the likelihood is divided by: at least; per chi^2 of the parts
+SOFTEST, DISSENT = (
+    10.0,
+    10.0,
+)  # what the likelihood is divided by: at least; per chi^2 of the parts
 BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 
 

@@ -32,7 +32,10 @@ import numpy as np
 
 REWEIGHTINGS, STEPS = 3, 10  # of the image step
 SETTLING = 5  # reweightings after each of which noise and prior follow the image
-SIGMAS, PRIORS = (5e-4, 0.1), (0.2, 60.0)  # where they stay
+PRIORS = (0.2, 60.0)  # where its weight stays
+# Least sigma: 8 bit rounding for averaged values; a real camera hides its noise, and more is
+# unexplained there.
+SIGMA_LEAST, SIGMA_MOST = {'linear': 5e-4, 'srgb': 0.012}, 0.1
 OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # of the links, in rows and columns
 AROUND = 64  # px of noise beyond a part of the frame, so that its margin may change
 
@@ -126,7 +129,8 @@ def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: Float
     left = float(planes @ data.sum((1, 2), dtype=np.float64)) / max(part.counts.sum(), 1.0)
     rough = float(planes @ _roughness(problem, latent)) / sigma**2
     return Scales(
-        float(np.clip(math.sqrt(left), *SIGMAS)), float(np.clip(prior / max(rough, 1e-9), *PRIORS))
+        float(np.clip(math.sqrt(left), SIGMA_LEAST[part.camera.transfer], SIGMA_MOST)),
+        float(np.clip(prior / max(rough, 1e-9), *PRIORS)),
     )
 
 
