@@ -28,6 +28,7 @@ setup(
                 'config/fastdds.xml',
                 'config/foxglove.json',
                 'config/paper.yaml',
+                'config/sros2_policy.xml',
                 'config/view.rviz',
             ],
         ),

@@ -15,7 +15,7 @@ import threading
 from typing import Any, Generic, TypeVar
 
 import cv2
-from depth_deblur_ros.core.data import CameraIntrinsics, Motion, RgbdFrame
+from depth_deblur_ros.core.data import CameraIntrinsics, MAX_PIXELS, Motion, RgbdFrame
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
 from depth_deblur_ros.frames import Pair
@@ -28,6 +28,9 @@ T = TypeVar('T')
 OVERTAKEN = 'overtaken by a newer pair while the solver was busy'
 KEPT = 30  # frames that may wait for their depth: a second of 30 Hz
 PATIENCE_NS = 2_000_000_000  # no depth comes later than that
+KEPT_BYTES = 1 << 30  # of the frames that wait, and of the depths; two of each always may
+MAX_BYTES = 4 * MAX_PIXELS  # of one message; larger ones are not taken
+TOO_LARGE = f'a message of more than {MAX_BYTES} bytes'
 KEPT_INFOS = 30
 KEPT_EXPOSURES = 300
 # glibc's M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_TOP_PAD, bytes: an image's memory stays with the
@@ -164,12 +167,18 @@ class Intake:
     def push_colour(self, msg: Any, came_ns: int) -> None:
         """Take a colour message that came at this time."""
         self.arrived += 1
+        if not self._has_room(msg):
+            self._dropped[TOO_LARGE] += 1
+            return
         pair = Pair(msg, None, None, None, came_ns)
         self._offer(self._pairer.push_colour(stamp_ns(msg.header), pair))
 
     def push_depth(self, msg: Any) -> None:
         """Take a depth message."""
-        self._offer(self._pairer.push_depth(stamp_ns(msg.header), msg))
+        if self._has_room(msg):
+            self._offer(self._pairer.push_depth(stamp_ns(msg.header), msg))
+        else:
+            self._pairer.unused_depths += 1
 
     def push_exposure(self, exposure: float | None, came_ns: int) -> None:
         """Take an exposure time [s] for what comes later; None: unknown from then on."""
@@ -224,6 +233,12 @@ class Intake:
         """The smallest gap between colour and depth stamps that was too wide for a pair."""
         miss = self._pairer.nearest_miss_ns
         return None if miss is None else miss / 1e9
+
+    def _has_room(self, msg: Any) -> bool:
+        """Whether a message may wait; of large ones only a few may."""
+        size = len(msg.data)
+        self._pairer.keep = max(2, min(KEPT, KEPT_BYTES // max(1, size)))
+        return size <= MAX_BYTES
 
     def _offer(self, found: list[tuple[Pair, Any]]) -> None:
         for colour, depth in found:

@@ -41,7 +41,7 @@ class StampPairer(Generic[A, B]):
         self.unused_depths = 0
         self.nearest_miss_ns: int | None = None
         self.slop_ns = slop_ns
-        self._keep = keep
+        self.keep = keep
         self._depth: dict[int, B] = {}
         self._used: set[int] = set()
         self._forget_all()
@@ -120,7 +120,7 @@ class StampPairer(Generic[A, B]):
         while self._colour:
             stamp = min(self._colour)
             known = self._newest_depth >= stamp
-            if waiting and not known and len(self._colour) <= self._keep:
+            if waiting and not known and len(self._colour) <= self.keep:
                 break
             pairs += self._decide_one(stamp)
         self._forget()
@@ -150,7 +150,7 @@ class StampPairer(Generic[A, B]):
         """Drop depths that no colour frame to come can want, and the oldest of too many."""
         passed = sorted(stamp for stamp in self._depth if stamp <= self._decided)
         self._forget_depths(passed[:-1])
-        self._forget_depths(sorted(self._depth)[: -self._keep])
+        self._forget_depths(sorted(self._depth)[: -self.keep])
 
     def _forget_depths(self, stamps: list[int]) -> None:
         self.unused_depths += sum(stamp not in self._used for stamp in stamps)

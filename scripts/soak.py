@@ -104,6 +104,7 @@ class Soak:
         self._values: dict[str, str] = {}
         self.memory: list[tuple[float, float]] = []
         self.heard = 0
+        self._clients: dict[str, Any] = {}
 
     def run(self) -> dict[str, Any]:
         """Run for the time and give the figures."""
@@ -220,21 +221,22 @@ class Soak:
             request = ChangeState.Request()
             request.transition.id = number
             done = self._call(ChangeState, '/depth_deblur/change_state', request)
-            if not done.success:
+            if done and not done.success:
                 self.unbalanced.append(f'transition {number} was refused')
 
     def _call(self, kind: Any, service: str, request: Any) -> Any:
-        client = self._peer.create_client(kind, service)
-        try:
-            if not client.wait_for_service(30):
-                raise TimeoutError(f'{service} is not there')
+        """Call a service of the node; None where it does not answer."""
+        client = self._clients.get(service) or self._peer.create_client(kind, service)
+        self._clients[service] = client
+        if self._node.poll() is not None:
+            raise RuntimeError(f'the node has ended: {self._node.returncode}')
+        if client.wait_for_service(30):
             future = client.call_async(request)
             rclpy.spin_until_future_complete(self._peer, future, timeout_sec=60)
-            if not future.done():
-                raise TimeoutError(f'{service} does not answer')
-            return future.result()
-        finally:
-            self._peer.destroy_client(client)
+            if future.done():
+                return future.result()
+        self.events['no answer'] += 1
+        return None
 
     def _figures(self, code: int) -> dict[str, Any]:
         self._book()

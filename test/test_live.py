@@ -24,7 +24,8 @@ def message(stamp):
     """Give a message with a header of this stamp [ms]."""
     sec, ms = divmod(stamp, 1000)
     stamp = SimpleNamespace(sec=sec, nanosec=ms * MS)
-    return SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id='camera'))
+    header = SimpleNamespace(stamp=stamp, frame_id='camera')
+    return SimpleNamespace(header=header, data=b'')
 
 
 def test_a_newer_item_displaces_the_one_that_waits():
@@ -205,3 +206,18 @@ def test_preparing_the_solver_leaves_nothing_to_make_once():
     template_table.cache_clear()
     compile_kernels()
     assert template_table.cache_info().currsize == 1
+
+
+def test_large_messages_that_wait_stay_within_a_gigabyte():
+    intake, held = Intake(0.02), range(1 << 28)  # its length is a quarter of a gigabyte
+    for number in range(20):
+        colour = message(40 * number)
+        colour.data = range(250_000_000)
+        intake.push_colour(colour, number)
+    assert intake.waiting <= 5
+    assert intake.arrived == intake.dropped.total() + intake.waiting
+    colour = message(1000)
+    colour.data = held
+    intake.push_colour(colour, 1000)
+    assert intake.dropped['a message of more than 256000000 bytes'] == 1
+    assert intake.arrived == intake.dropped.total() + intake.waiting
