@@ -7,7 +7,7 @@ A frame goes through these steps, docs/method.md (40) to (53):
 2 glide.py: these and the past give the velocity u at this frame, with its covariance
 3 the solver finds the motion p in the blur, u times the exposure being a further start
 4 joining.py: p against u tells the sign, and the exposure where nobody does (shutter.py); both
-  together are the motion under which the image is restored
+  together are the motion; the image is restored anew where that is another one
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from depth_deblur_ros.between import Between, motion_between, View, view_of
 from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame
+from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
 from depth_deblur_ros.glide import unknown_glide
@@ -30,7 +31,7 @@ import numpy as np
 
 GAP_S = 0.25  # frames farther apart are not neighbours
 USUAL_S = 1 / 30  # frame interval before any is seen
-RESTORED_PX = 1.0  # px; less blur leaves the image as it was
+OTHER_PX = 1.0  # px; motions less apart than this give the same image
 REMEMBERED = 31  # frame intervals that tell how even the stamps are
 
 
@@ -118,7 +119,7 @@ class Tracker:
         self._shutter = joined.shutter
         if joined.velocity:
             self._glide = self._glide.measured(*joined.velocity)
-        result = self._restored(frame, params, joined.result)
+        result = self._restored(frame, params, alone, joined.result)
         return Tracked(replace(result, seconds=result.seconds + spent), joined.exposure)
 
     def _context(
@@ -190,17 +191,19 @@ class Tracker:
         return replace(way, covariance=way.covariance + along)
 
     def _alone(self, frame: RgbdFrame, params: SolverParams, start: Motion | None) -> DeblurResult:
-        """Solve the frame by itself; its image can wait until the motion is settled."""
-        if self._solve is deblur:
-            params = replace(params, mode='motion')
+        """Solve the frame by itself, from a further start where there is one."""
         return self._solve(frame, params, start=start) if start else self._solve(frame, params)
 
     def _restored(
-        self, frame: RgbdFrame, params: SolverParams, result: DeblurResult
+        self, frame: RgbdFrame, params: SolverParams, alone: DeblurResult, result: DeblurResult
     ) -> DeblurResult:
-        """Restore the image under the motion that was settled."""
+        """Restore the image anew where the motion that was settled is not the frame's own."""
         wanted = params.mode != 'motion' and result.outcome is Outcome.SOLVED
-        if self._solve is not deblur or not wanted or result.blur_px < RESTORED_PX:
+        if self._solve is not deblur or not wanted:
+            return result
+        own, settled = alone.motion.vector, result.motion.vector
+        off = min(blur_length(settled + s * own, result.depth, frame.camera) for s in (1, -1))
+        if off < OTHER_PX:
             return result
         known = restore_known(replace(frame, depth=result.depth), result.motion, params)
         return replace(result, image=known.image, seconds=result.seconds + known.seconds)
