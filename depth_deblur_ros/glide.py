@@ -3,7 +3,7 @@ How the camera moves from frame to frame: velocity and acceleration, as a Gaussi
 
 The scene's velocity u (6,) [rad/s, m/s] in the camera's frame changes by an acceleration that
 forgets itself within MEMORY; what is measured is the way c between two frames, and u itself,
-docs/method.md (43) to (46). Motion over an exposure T is T u.
+docs/method.md (43) to (45). Motion over an exposure T is T u.
 [S70] Singer, IEEE Trans. AES 6, 1970: the model. [RTS65] Rauch, Tung & Striebel: looking ahead.
 """
 
@@ -79,7 +79,7 @@ def unknown_glide() -> Glide:
 
 
 def _stirred(unrest: Vector, miss: Vector, expected: Vector) -> Vector:
-    """Fit the unrest to how far turn and shift missed what was expected, (46)."""
+    """Fit the unrest to how far turn and shift missed what was expected, (45)."""
     parts = (slice(0, 3), slice(3, 6))
     off = [miss[k] @ np.linalg.solve(expected[k, k], miss[k]) / 3 for k in parts]
     ratio = np.clip(off, 0.1, 25)

@@ -183,7 +183,7 @@ class Tracker:
         return statistics.median(self._intervals) if self._intervals else USUAL_S
 
     def _uneven(self, way: Between, seconds: float) -> Between:
-        """Give a way with the doubt that uneven stamps bring, (46)."""
+        """Give a way with the doubt that uneven stamps bring, (44)."""
         usual = self._interval()
         off = [abs(s - usual * max(1, round(s / usual))) for s in self._intervals]
         jitter = 1.5 * statistics.median(off) if off else 0.0
