@@ -1,4 +1,4 @@
-"""A replay that is killed and goes on gives what one gives that was left alone, to the byte."""
+"""A replay that is killed and goes on gives the messages of one that was left alone."""
 
 import json
 import os
@@ -12,6 +12,8 @@ import time
 from depth_deblur_ros.bag import BagReader, BagWriter
 from depth_deblur_ros.core.data import InputError
 from depth_deblur_ros.messages import header_fields, image_fields
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 import pytest
 import stub_replay
@@ -92,12 +94,20 @@ def start(bag, out, moment=None, *, wait=True, seconds=0.0, **options):
 
 
 def files(out):
-    """Give the content of a bag and of its estimates."""
-    return [
-        (out / f'{out.name}.mcap').read_bytes(),
-        Path(f'{out}.jsonl').read_text(),
-        sorted(p.name for p in out.iterdir()),
-    ]
+    """Give the messages of a bag in their order, and its estimates, all but the time it took."""
+    assert sorted(p.name for p in out.iterdir()) == ['metadata.yaml', f'{out.name}.mcap']
+    messages = []
+    with (out / f'{out.name}.mcap').open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        found = reader.iter_decoded_messages(log_time_order=False)
+        for _, channel, message, content in found:
+            data = message.data
+            if channel.topic == '/result':
+                values = [(v.key, v.value) for v in content.values if v.key != 'seconds']
+                data = (content.level, content.name, content.message, values)
+            messages.append((channel.topic, message.log_time, data))
+    lines = [json.loads(line) for line in Path(f'{out}.jsonl').read_text().splitlines()]
+    return messages, [{**line, 'seconds': None} for line in lines]
 
 
 @pytest.fixture(scope='module')
