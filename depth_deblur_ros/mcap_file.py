@@ -99,7 +99,7 @@ class McapFile:
         self.blocks: list[Block] = []
         self.topics: dict[int, Topic] = {}
         self.damage: list[str] = []
-        self._doubted: dict[int, Topic] = {}
+        self._proved = self._doubted = dict[int, Topic]()  # told by the data; by a wrong summary
         self.stated: int | None = None
         self.given: dict[Record, int] = {}
         self._schemas: dict[int, Schema] = {}
@@ -194,7 +194,7 @@ class McapFile:
         elif record.opcode == STATISTICS:
             self._count(self._bytes(record))
         elif record.opcode == DATA_END:
-            self._summary = record.end
+            self._summary, self._proved = record.end, dict(self.topics)
             self._check(record)
         elif record.opcode == FOOTER:
             self._whole = True
@@ -212,7 +212,7 @@ class McapFile:
         told = int.from_bytes(self._bytes(footer)[-4:], 'little')
         if told and self._summary and self._checksum(self._summary, footer.end - 4) != told:
             self._note('the checksum of its summary is wrong')
-            self._doubted, self.topics, self.stated = self.topics, {}, None
+            self._doubted, self.topics, self.stated = self.topics, self._proved, None
 
     def _checksum(self, begin: int, end: int) -> int:
         self._stream.seek(begin)

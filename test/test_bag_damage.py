@@ -9,7 +9,7 @@ import zlib
 from bag_parts import COUNT, EXPECTED, others, raw, read, string, TEXTS, write_mcap, write_rosbag
 from depth_deblur_ros.bag import BagReader
 from depth_deblur_ros.core.data import InputError
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
 import pytest
@@ -97,6 +97,7 @@ def test_flipped_bits_cost_no_more_than_with_any_reader(folder, layout, flips):
 
 @settings(max_examples=100)
 @given(layout=layouts, begin=parts, length=st.integers(1, 400), fill=st.sampled_from([0, 255, 5]))
+@example(layout='no chunks', begin=0.890625, length=1, fill=0)  # a channel in the summary
 def test_an_overwritten_stretch_costs_what_it_covers(folder, layout, begin, length, fill):
     content = bytearray((folder / layout).read_bytes())
     at = int(begin * len(content))
