@@ -136,7 +136,7 @@ def test_each_frame_takes_the_exposure_that_was_sent_just_before_it(peer, start)
         if number % 3 == 0:  # some wait together
             peer.spin(0.1)
     values = peer.settled(arrived=31)
-    assert int(values['published']) == len(twists) > 5
+    assert int(values['published']) == len(twists) > 2
     for stamp, twist in zip(stamps(twists), twists, strict=True):
         number = (stamp - START) // 33_000_000
         assert twist.twist.angular.z == -0.03 / (number / 64 if number else 1.0)
