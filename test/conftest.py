@@ -35,3 +35,14 @@ def data():
     if not folder:
         pytest.skip('DEPTH_DEBLUR_DATA is not set')
     return Path(folder)
+
+
+@pytest.fixture
+def peer(monkeypatch):
+    """Give what speaks to a live node from another process, in a domain of its own."""
+    import ros_parts  # ROS is not everywhere
+
+    ros_parts.private_domain(monkeypatch)
+    made = ros_parts.Peer()
+    yield made
+    made.close()

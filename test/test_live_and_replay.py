@@ -18,8 +18,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 import pytest
-import ros_parts
-from ros_parts import COLOUR, DEPTH, INFO, Peer, Process
+from ros_parts import COLOUR, DEPTH, INFO, Process
 from sensor_msgs.msg import CameraInfo, Image
 from turning import CAMERA, EXPOSURE, frame, Knowing, rate, START_NS
 
@@ -27,14 +26,6 @@ pytestmark = pytest.mark.ros
 NODE = (sys.executable, str(Path(__file__).with_name('turning_node.py')))
 FRAMES = 12
 KINDS = {COLOUR: Image, DEPTH: Image, INFO: CameraInfo}
-
-
-@pytest.fixture
-def peer(monkeypatch):
-    ros_parts.private_domain(monkeypatch)
-    made = Peer()
-    yield made
-    made.close()
 
 
 def messages(number):

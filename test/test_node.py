@@ -24,7 +24,6 @@ from ros_parts import (
     DEPTH,
     depth_message,
     INFO,
-    Peer,
     Process,
     qos,
     STUB,
@@ -38,14 +37,6 @@ pytestmark = pytest.mark.ros
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
-
-
-@pytest.fixture
-def peer(monkeypatch):
-    ros_parts.private_domain(monkeypatch)
-    made = Peer()
-    yield made
-    made.close()
 
 
 @pytest.fixture

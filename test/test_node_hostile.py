@@ -14,7 +14,6 @@ from ros_parts import (
     DEPTH,
     depth_message,
     INFO,
-    Peer,
     Process,
     STUB,
 )
@@ -26,14 +25,6 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
 GROWTH_MB = 400  # what hostile input may cost; one image that it claims would be 768 MB
-
-
-@pytest.fixture
-def peer(monkeypatch):
-    ros_parts.private_domain(monkeypatch)
-    made = Peer()
-    yield made
-    made.close()
 
 
 @pytest.fixture
