@@ -5,7 +5,9 @@ usage: python scripts/soak.py [--seconds S] [--seed N]; prints one line of JSON.
 The publisher drops messages, repeats stamps, jumps in time, sends images that are black, cut, or
 of another size, and is killed and started again; the node's parameters are changed and it goes
 through its life cycle. In every status the accounts must balance: arrived = published + dropped +
-waiting. Memory is what is resident and the process's own.
+waiting. Memory is what is resident and the process's own, and is given for each twentieth of the
+time too. A service that does not answer on a busy machine is counted and the soak goes on; a node
+that has ended stops it, and its last words are told.
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ from typing import Any
 
 from bench_node import private_environment
 from diagnostic_msgs.msg import DiagnosticArray
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 import numpy as np
 import play_bag
 from rcl_interfaces.srv import SetParameters
@@ -39,6 +41,8 @@ from sensor_msgs.msg import Image
 NODE = 'import sys; from depth_deblur_ros.node import main; sys.exit(main())'
 RATE = 30.0
 EVENT_S = (2.0, 8.0)  # between two events
+PATIENCE_S = 120.0  # for a service: the machine may be busy
+PARTS = 20  # of the time, for the course of the memory
 SETTLED = 0.25  # of the time: until then buffers and pools grow to their size
 COLOUR, DEPTH = '/camera/rgb/image_color', '/camera/depth/image'
 
@@ -126,7 +130,7 @@ class Soak:
             self._player.wait()
             self._settle()
             self._node.send_signal(signal.SIGINT)
-            code = self._node.wait(60)
+            code = self._node.wait(PATIENCE_S)
         finally:
             for process in (self._node, self._player):
                 process.kill()
@@ -140,20 +144,21 @@ class Soak:
         begin = time.monotonic()
         event = begin + 10
         sampled = begin
-        while (now := time.monotonic()) < begin + self._seconds:
+        while (now := time.monotonic()) < begin + self._seconds and self._node.poll() is None:
             rclpy.spin_once(self._peer, timeout_sec=0.05)
             if now >= sampled:
                 self.memory.append((now - begin, memory_mb(self._node.pid)))
                 sampled = now + 1
             if now >= event:
                 action = self._rng.choice([self._kill, self._change, self._pause, self._rest])
-                action()
+                if self._is_active():
+                    action()
                 event = time.monotonic() + self._rng.uniform(*EVENT_S)
 
     def _settle(self) -> None:
         """Wait until nothing waits any more, by a status that is new."""
         self._values = {}
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE_S
         while self._values.get('waiting') != '0' and time.monotonic() < end:
             rclpy.spin_once(self._peer, timeout_sec=0.1)
 
@@ -216,26 +221,39 @@ class Soak:
             Transition.TRANSITION_ACTIVATE,
         )
 
+    def _is_active(self) -> bool:
+        """Whether the node is active; go on to it where a step had no answer in time."""
+        found = self._call(GetState, '/depth_deblur/get_state', GetState.Request())
+        state = found.current_state.id if found else None
+        if state == State.PRIMARY_STATE_UNCONFIGURED:
+            self._through(Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+        elif state == State.PRIMARY_STATE_INACTIVE:
+            self._through(Transition.TRANSITION_ACTIVATE)
+        return bool(state == State.PRIMARY_STATE_ACTIVE)
+
     def _through(self, *transitions: int) -> None:
         for number in transitions:
             request = ChangeState.Request()
             request.transition.id = number
             done = self._call(ChangeState, '/depth_deblur/change_state', request)
-            if done and not done.success:
+            if not done:
+                return
+            if not done.success:
                 self.unbalanced.append(f'transition {number} was refused')
 
     def _call(self, kind: Any, service: str, request: Any) -> Any:
         """Call a service of the node; None where it does not answer."""
         client = self._clients.get(service) or self._peer.create_client(kind, service)
         self._clients[service] = client
-        if self._node.poll() is not None:
-            raise RuntimeError(f'the node has ended: {self._node.returncode}')
-        if client.wait_for_service(30):
-            future = client.call_async(request)
-            rclpy.spin_until_future_complete(self._peer, future, timeout_sec=60)
-            if future.done():
+        end = time.monotonic() + PATIENCE_S
+        future = None
+        while time.monotonic() < end and self._node.poll() is None:
+            rclpy.spin_once(self._peer, timeout_sec=0.1)
+            if future is None and client.service_is_ready():
+                future = client.call_async(request)
+            if future and future.done():
                 return future.result()
-        self.events['no answer'] += 1
+        self.events[f'no answer from {service}'] += 1
         return None
 
     def _figures(self, code: int) -> dict[str, Any]:
@@ -243,14 +261,17 @@ class Soak:
         times, memory = np.array(self.memory).T
         late = times > SETTLED * self._seconds
         slope = np.polyfit(times[late], memory[late], 1)[0] if late.sum() > 2 else 0.0
+        parts = [m for m in np.array_split(memory, PARTS) if m.size]
         return {
-            'seconds': round(self._seconds),
+            'seconds': round(float(times[-1])),
             'exit code': code,
+            'last words': '' if code == 0 else (self._logs / 'node').read_text()[-2000:],
             'unbalanced': self.unbalanced[:5],
             'events': dict(self.events),
             'counts': dict(sorted(self.totals.items())),
             'images heard': self.heard,
             'memory [MB]': [round(float(memory[late].mean())), round(float(memory[late].max()))],
+            'its course [MB]': [round(float(part.mean())) for part in parts],
             'slope [MB/min]': round(60 * float(slope), 2),
         }
 
