@@ -119,7 +119,9 @@ def _missing(bag: BagReader, role: str, found: str) -> InputError:
 
 class PairReader:
     """
-    Read the colour-depth pairs of a bag; `dropped` counts what found no pair, by reason.
+    Read the colour-depth pairs of a bag; `dropped` counts the colour without one, by reason.
+
+    `unread` counts the messages beside them that cannot be read, by topic.
 
     on_message, where given, sees every message of the bag in passing, on_imu those of the gyro.
     The camera_info is the latest before the colour frame; before the first, the first.
@@ -142,6 +144,7 @@ class PairReader:
         self._info = first_camera(bag, topics.info) if topics.info else None
         self._exposure: float | None = None
         self.dropped: Counter[str] = self._pairer.dropped
+        self.unread: Counter[str] = Counter()
 
     @property
     def nearest_miss_s(self) -> float | None:
@@ -164,7 +167,10 @@ class PairReader:
         try:
             content = self._checked(name, decoded(message))
         except InputError:
-            self.dropped[f'a message on {name} cannot be read'] += 1
+            if name == self._topics.colour:
+                self.dropped[f'a message on {name} cannot be read'] += 1
+            else:
+                self.unread[name] += 1
             return
         if name == self._topics.info:
             self._info = content

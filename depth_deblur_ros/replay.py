@@ -42,6 +42,7 @@ class ReplaySummary:
     outcomes: Counter[Outcome] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)  # among the failed, by reason
     dropped: Counter[str] = field(default_factory=Counter)  # colour frames without a pair
+    unread: Counter[str] = field(default_factory=Counter)  # other messages, by topic
     damage: list[str] = field(default_factory=list)  # what could not be read, and where
 
     def count(self, outcome: str, reason: str) -> None:
@@ -54,14 +55,15 @@ class ReplaySummary:
     @property
     def complete(self) -> bool:
         """Whether no frame failed or was lost."""
-        lost = self.outcomes[Outcome.FAILED] + self.dropped.total() + len(self.damage)
-        return lost == 0
+        lost = self.outcomes[Outcome.FAILED] + self.dropped.total() + self.unread.total()
+        return lost + len(self.damage) == 0
 
     def __str__(self) -> str:
         outcomes = ', '.join(f'{self.outcomes[outcome]} {outcome.value}' for outcome in Outcome)
         lines = [f'{self.pairs} pairs: {outcomes}']
         for title, reasons in (('failed', self.refused), ('dropped', self.dropped)):
             lines += [f'{title} {count}: {reason}' for reason, count in reasons.most_common()]
+        lines += [f'unreadable {count}: {topic}' for topic, count in self.unread.most_common()]
         return '\n'.join([*lines, *(f'damaged: {note}' for note in self.damage)])
 
 
@@ -117,7 +119,7 @@ def replay(
             tracker = Tracker(solve)
             slop_ns = round(sync_slop_s * 1e9)
             pairs = PairReader(reader, names, slop_ns, copy, on_imu=tracker.gyro.take)
-            summary = ReplaySummary(dropped=pairs.dropped)
+            summary = ReplaySummary(dropped=pairs.dropped, unread=pairs.unread)
             work = _Work(writer, journal, tracker, params, given, on_frame)
             for pair, following in _with_next(pairs.pairs(*span)):
                 done = work.finish(pair, following)
@@ -250,6 +252,7 @@ def _check_some_solved(summary: ReplaySummary, pairs: PairReader, names: Topics)
         )
     if not summary.pairs:
         dropped = ''.join(f'; {n} x {reason}' for reason, n in summary.dropped.items())
+        dropped += ''.join(f'; {n} unreadable on {topic}' for topic, n in summary.unread.items())
         raise InputError(f'no pair on {names.colour} and {names.depth}{dropped}{damage}')
     if summary.refused.total() == summary.pairs:
         reason = summary.refused.most_common(1)[0][0]

@@ -220,6 +220,20 @@ def test_colour_frames_without_depth_are_counted(tmp_path):
     assert 'dropped 1: no depth within the slop' in str(summary)
 
 
+def test_a_message_that_is_no_frame_and_cannot_be_read_is_no_lost_frame(tmp_path):
+    with BagWriter(tmp_path / 'in') as bag:
+        write_info(bag)
+        broken = {'header': {'stamp': {'sec': 1, 'nanosec': 1_000_000_000}, 'frame_id': 'imu'}}
+        bag.write('/imu', 'sensor_msgs/msg/Imu', broken, START)
+        for i in range(FRAMES):
+            write_colour(bag, i)
+            write_depth(bag, i)
+    summary = run(tmp_path / 'in', tmp_path / 'out')
+    assert (summary.pairs, summary.complete) == (FRAMES, False)
+    assert not summary.dropped and summary.unread == {'/imu': 1}
+    assert 'unreadable 1: /imu' in str(summary)
+
+
 def test_a_camera_info_that_comes_late_serves_from_the_start(tmp_path):
     with BagWriter(tmp_path / 'in') as bag:
         for i in range(FRAMES):
