@@ -53,10 +53,13 @@ setup(
             f'ros-jazzy-rclpy[fastrtps]==7.1.6{ON_X86_LINUX}',
             f'ros-jazzy-common-interfaces==5.3.6{ON_X86_LINUX}',
         ],
+        'cluster': ['distributed>=2024.4'],
         'fuzz': ["atheris>=3.0; sys_platform == 'linux'"],
         'bench': ['scikit-image>=0.22'],
         'test': [
             'setuptools>=71',
+            'distributed>=2024.4',
+            "atheris>=3.0; sys_platform == 'linux' and platform_machine == 'x86_64'",
             'pytest>=8',
             'pytest-timeout>=2.2',
             'hypothesis>=6.98',

@@ -9,14 +9,20 @@ What is slow to load is imported by the command that needs it, so that --help is
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 import sys
-from typing import NoReturn
+from typing import NoReturn, TYPE_CHECKING
 
-from depth_deblur_ros.core.data import DeblurResult, InputError, Outcome, RgbdFrame
+from depth_deblur_ros.core.data import InputError, Outcome
 from depth_deblur_ros.flags import Parser, solver_flags, solver_params, topic
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from depth_deblur_ros.cluster import Cluster
+    from depth_deblur_ros.job import Job
+    from depth_deblur_ros.many import Pool
 
 DONE, SOME_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 BAG_LIBRARIES = {'lz4', 'mcap', 'rosbags', 'zstandard'}  # a robot may lack them
@@ -32,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(str(error), BAD_INPUT)
     except ModuleNotFoundError as error:
         missing = str(error.name).split('.')[0]
+        if missing == 'distributed':
+            return _refuse("--scheduler needs distributed: pip install 'distributed'", BAD_INPUT)
         if missing not in BAG_LIBRARIES:
             raise
         return _refuse(f'bags need {missing}: pip install {missing}', BAD_INPUT)
@@ -71,6 +79,8 @@ def _parser() -> argparse.ArgumentParser:
     _sequence_flags(command('sequence', _sequence, 'the sharp frames hidden in one exposure'))
     _replay_flags(command('replay', _replay, 'a bag: every pair solved, results in another bag'))
     _report_flags(command('report', _report, 'a replayed bag: one HTML page, pictures and plots'))
+    apart = commands.add_parser('job', description='what replay of many bags starts for each')
+    apart.set_defaults(run=_job)
     return parser
 
 
@@ -180,8 +190,10 @@ def _import_tum(args: argparse.Namespace) -> int:
 
 
 def _replay_flags(parser: Parser) -> None:
-    parser.add_argument('bag', type=Path, help='rosbag2 folder or .mcap file to read')
-    parser.add_argument('out', type=Path, help='bag to write')
+    parser.add_argument(
+        'bag', nargs='+', help='rosbag2 folder or .mcap file to read; several, or a pattern'
+    )
+    parser.add_argument('out', type=Path, help='bag to write; of many bags, the folder for them')
     parser.add_argument('--estimates', type=Path, metavar='FILE', help='one line of JSON per pair')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='one picture per frame')
     parser.add_argument('--report', action='store_true', help='one page of the run: OUT.html')
@@ -193,6 +205,13 @@ def _replay_flags(parser: Parser) -> None:
     parser.add_argument('--overwrite', action='store_true', help='replace OUT if it is there')
     parser.add_argument(
         '--resume', action='store_true', help='go on where a run of the same kind was killed'
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        '--workers', type=int, metavar='N', help='many bags: so many at a time (default: 1)'
+    )
+    where.add_argument(
+        '--scheduler', metavar='ADDRESS', help='many bags: on a cluster of dask.distributed'
     )
     solver_flags(parser)
 
@@ -209,33 +228,72 @@ def _source_flags(parser: Parser) -> None:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from depth_deblur_ros.folders import read_camera
-    from depth_deblur_ros.replay import replay
+    from depth_deblur_ros.job import run_job
+    from depth_deblur_ros.many import is_pattern
 
-    params = solver_params(args)
-    camera = read_camera(args.camera) if args.camera else None
-    exposure = camera.exposure if camera and args.exposure_s is None else args.exposure_s
-    with tqdm(unit='frame', disable=None) as bar:
-        summary = replay(
-            args.bag,
-            args.out,
-            params=params,
-            camera=camera.intrinsics if camera else None,
-            exposure_s=exposure,
-            topics=dict(args.topics or ()),
-            start=args.start,
-            duration=args.duration,
-            all_topics=args.all_topics,
-            estimates=args.estimates,
-            progress=_progress(bar),
-            on_frame=_painter(args.pictures) if args.pictures else None,
-            overwrite=args.overwrite,
-            resume=args.resume,
-        )
-    print(f'{args.out}: {summary}')
-    if args.report:
-        _write_report(args, _page_of(args.out), summary.dropped)
-    return DONE if summary.complete else SOME_FAILED
+    job = _job_of(args)
+    many = len(args.bag) > 1 or is_pattern(args.bag[0])
+    if many or args.scheduler or args.workers is not None:
+        return _replay_many(args, job)
+    said: list[str] = []
+    try:
+        with tqdm(unit='frame', disable=None) as bar:
+            complete = run_job(job, said.append, _progress(bar))
+    finally:
+        print(*said, sep='\n', end='\n' * bool(said))
+    return DONE if complete else SOME_FAILED
+
+
+def _replay_many(args: argparse.Namespace, whole: Job) -> int:
+    """Replay many bags into one folder, tell each as it ends, and at last those that failed."""
+    from depth_deblur_ros import many
+
+    jobs = many.jobs_of(many.find_bags(args.bag), whole)
+    threads = getattr(args, 'threads', None)  # as the line says, not the file
+    with _place(args, threads) as place, tqdm(unit='frame', disable=None) as bar:
+        many.note_settings(whole)
+        failures, skipped = [], 0
+        for job, done in many.replay_many(jobs, place, _progress(bar)):
+            if done is None:
+                skipped += 1
+                continue
+            bar.write(done.said)
+            if done.code != DONE:
+                failures.append(f'{job.bag}: {done.why}')
+    fresh = len(jobs) - skipped - len(failures)
+    print(f'{len(jobs)} bags: {fresh} done, {skipped} done before, {len(failures)} with failures')
+    print(*(f'failed: {failure}' for failure in failures), sep='\n', end='\n' * bool(failures))
+    return SOME_FAILED if failures else DONE
+
+
+def _place(args: argparse.Namespace, threads: int | None) -> Cluster | Pool:
+    if args.scheduler:
+        from depth_deblur_ros.cluster import Cluster
+
+        return Cluster(args.scheduler, threads)
+    from depth_deblur_ros.many import Pool
+
+    return Pool(1 if args.workers is None else args.workers, threads)
+
+
+def _job(_: argparse.Namespace) -> int:
+    from depth_deblur_ros.job import job_from_parent, run_job
+
+    return DONE if run_job(job_from_parent(), print) else SOME_FAILED
+
+
+def _job_of(args: argparse.Namespace) -> Job:
+    from depth_deblur_ros.folders import read_camera
+    from depth_deblur_ros.job import Job
+
+    told = {f.name for f in fields(Job)} - {'bag', 'params', 'camera', 'topics'}
+    return Job(
+        bag=Path(args.bag[0]),
+        params=solver_params(args),
+        camera=read_camera(args.camera) if args.camera else None,
+        topics=dict(args.topics or ()),
+        **{name: getattr(args, name) for name in told},
+    )
 
 
 def _report_flags(parser: Parser) -> None:
@@ -247,32 +305,14 @@ def _report_flags(parser: Parser) -> None:
 
 
 def _report(args: argparse.Namespace) -> int:
-    _write_report(args, args.page or _page_of(args.out))
+    from depth_deblur_ros.folders import read_camera
+    from depth_deblur_ros.job import Job, page_of, write_page
+
+    camera = read_camera(args.camera) if args.camera else None
+    topics = dict(args.topics or ())
+    job = Job(args.bag, args.out, camera=camera, topics=topics, estimates=args.estimates)
+    print(write_page(job, args.page or page_of(args.out)))
     return DONE
-
-
-def _page_of(bag: Path) -> Path:
-    whole = bag.resolve()
-    return whole.with_name(f'{whole.name}.html')
-
-
-def _write_report(
-    args: argparse.Namespace, page: Path, lost: Mapping[str, int] | None = None
-) -> None:
-    from depth_deblur_ros.folders import read_camera, write_text
-    from depth_deblur_ros.page import run_page
-    from depth_deblur_ros.review import review
-
-    run = review(
-        args.bag,
-        args.out,
-        camera=read_camera(args.camera).intrinsics if args.camera else None,
-        topics=dict(args.topics or ()),
-        estimates=args.estimates,
-        lost=lost,
-    )
-    write_text(page, run_page(run))
-    print(f'{page}: {len(run.notes)} frames, pictures of {len(run.shots)}')
 
 
 def _progress(bar: tqdm[NoReturn]) -> Callable[[int, int | None], None]:
@@ -281,14 +321,3 @@ def _progress(bar: tqdm[NoReturn]) -> Callable[[int, int | None], None]:
         bar.update(done - bar.n)
 
     return show
-
-
-def _painter(folder: Path) -> Callable[[int, RgbdFrame, DeblurResult], None]:
-    """Give what writes one picture per frame, by its number."""
-    from depth_deblur_ros.folders import write_image
-    from depth_deblur_ros.report import draw_frame
-
-    def paint(number: int, frame: RgbdFrame, result: DeblurResult) -> None:
-        write_image(folder / f'{number:05d}.png', draw_frame(frame, result))
-
-    return paint

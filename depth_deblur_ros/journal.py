@@ -49,7 +49,7 @@ class Journal:
 
     def __init__(self, out: Path, facts: Mapping[str, Any], *, resume: bool) -> None:
         out = Path(out).absolute()
-        self._all = out.parent / f'.{out.name}.unfinished'
+        self._all = _folder(out)
         self._facts = json.loads(json.dumps(facts))
         self._name = out.name
         self._resume = resume
@@ -133,6 +133,19 @@ class Journal:
                         f'{self._facts.get(name)}: leave out --resume to start anew'
                     )
         return begun
+
+
+def pairs_done(out: Path) -> int:
+    """Count the pairs that the attempts at this bag have done so far; from any process."""
+    count = 0
+    with suppress(OSError):  # they come and go
+        for lines in _folder(Path(out).absolute()).glob('*/lines'):
+            count = max(count, lines.read_bytes().count(b'\n') - 1)
+    return count
+
+
+def _folder(out: Path) -> Path:
+    return out.parent / f'.{out.name}.unfinished'
 
 
 class _Attempt:
