@@ -6,6 +6,7 @@ kernels: what a kernel scatters is gathered here, and an operator is a matrix wh
 its adjoint.
 """
 
+from depth_deblur_ros.core.templates import FLOOR, PATCH, REACH
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_matrix
@@ -137,16 +138,30 @@ def prior_matrix(links, scale):
     return matrix
 
 
+def templates(bins, us, v):
+    """Give log-spectra (n, len(us)) of straight blurs (u, v), each sinc by itself."""
+    fy, fx = np.meshgrid(np.fft.fftfreq(PATCH), np.fft.rfftfreq(PATCH), indexing='ij')
+    spectra = np.sinc(fx[None] * us[:, None, None] + fy[None] * v) ** 2
+    # The half spectrum is continued by its mirror image: S(-f) = S(f).
+    left = np.roll(spectra[:, ::-1, 1:2], 1, axis=1)
+    wide = np.concatenate([left, spectra, spectra[:, :, -2:-1]], 2)
+    wide = (wide[:, :, :-2] + 4 * wide[:, :, 1:-1] + wide[:, :, 2:]) / 6
+    wide = (np.roll(wide, 1, 1) + 4 * wide + np.roll(wide, -1, 1)) / 6
+    return np.log(wide + FLOOR).reshape(len(us), -1)[:, bins].T
+
+
 def score(q, evidence, even):
     """Give S of a motion with scipy's look-up of C and D."""
-    reach = evidence.energy.shape[0] - 1
     c, d = 0.0, even
-    for b, flow in enumerate(evidence.flow_of_q @ q):
+    for b, flow in enumerate(np.float64(evidence.flow_of_q) @ q):
         u, v = -flow if flow[1] < 0 else flow
-        if abs(u) >= reach or v >= reach:
+        if abs(u) >= REACH or v >= REACH:
             d += evidence.weight[b]
             continue
-        at = [[v], [u + reach]]
+        at = [[v], [u + REACH]]
         c += evidence.weight[b] * map_coordinates(np.float64(evidence.match[b]), at, order=1)[0]
-        d += evidence.weight[b] * map_coordinates(np.float64(evidence.energy), at, order=1)[0]
+        energy = map_coordinates(np.float64(evidence.energy), at, order=1)[0]
+        along, down = evidence.sag[int(v), int(u + REACH)]
+        energy -= u % 1 * (1 - u % 1) * along + v % 1 * (1 - v % 1) * down
+        d += evidence.weight[b] * energy
     return -c / np.sqrt(d)

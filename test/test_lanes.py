@@ -23,6 +23,8 @@ def calculate(a, b, at, out):
     lanes.store(out, 80, lanes.next_lane(x))
     lanes.store(out, 96, lanes.splat(b[at]))
     lanes.store(out, 112, lanes.tent(x))
+    lanes.store(out, 128, lanes.whole(x))
+    lanes.store(out, 144, lanes.where_positive(x, x, y))
     return lanes.last_lane(x), lanes.total(x, np.empty(16, np.float32))
 
 
@@ -30,11 +32,26 @@ def calculate(a, b, at, out):
 def test_each_lane_calculates_by_itself(pair, at):
     a, b = pair
     x, y = (array[at : at + 16] for array in pair)
-    out = np.full(8 * 16 + 1, 7, np.float32)
+    out = np.full(10 * 16 + 1, 7, np.float32)
     last, total = calculate(a, b, at, out)
     expected = [x + y, x - y, x * y, np.maximum(x, y), np.minimum(x, y), np.r_[0, x[:-1]]]
     expected += [np.full(16, y[0]), np.maximum(0, 1 - np.abs(x))]
-    np.testing.assert_allclose(out[:-1].reshape(8, 16), expected, rtol=1e-6)
+    expected += [np.trunc(x), np.where(x > 0, x, y)]
+    np.testing.assert_allclose(out[:-1].reshape(10, 16), expected, rtol=1e-6)
     assert out[-1] == 7
     assert last == x[-1]
     np.testing.assert_allclose(total, x.sum(dtype=np.float64), rtol=1e-5, atol=1e-5 * 16e6)
+
+
+@njit
+def look_up(a, places, out):
+    here, beside = lanes.pairs(a, lanes.load(places, 0))
+    lanes.store(out, 0, here)
+    lanes.store(out, 16, beside)
+
+
+@given(a=hnp.arrays(np.float32, 40, elements=numbers), seed=st.integers(0, 2**32 - 1))
+def test_pairs_lie_side_by_side(a, seed):
+    places, out = np.random.default_rng(seed).integers(0, 39, 16), np.empty(32, np.float32)
+    look_up(a, places.astype(np.float32), out)
+    np.testing.assert_array_equal(out, np.r_[a[places], a[places + 1]])

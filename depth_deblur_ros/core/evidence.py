@@ -1,96 +1,65 @@
 """
 What the spectra of patches say about a motion: the score that the blind start searches.
 
-A straight blur by u pixels multiplies the spectrum of a patch by sinc(f.u): its dark bands stand
-out of the log-spectrum whatever the scene is. All patches together say which motion p explains
-their bands, by a matched filter that is normalised, so that a template without bands cannot win,
-docs/method.md (8) to (11).
+The dark bands that a blur leaves stand out of the log-spectrum whatever the scene is. All patches
+together say which motion p explains their bands, by a matched filter that is normalised, so that
+a template without bands cannot win, docs/method.md (8) to (11).
 
-Notation: f spatial frequency [cycles/px]; u (2,) flow of a patch over the exposure [px];
-y_b log-spectrum of patch b and T_u template, both without what scenes have by themselves (a power
-law and a strength for each direction); C_b(u) = <y_b, T_u> / n; D(u) = |T_u|^2 / n;
-p = G q motion, q (6,) in pixels (motion_axes).
+Notation: u (2,) flow of a patch over the exposure [px]; y_b log-spectrum of patch b and T_u
+template (templates.py), both without what scenes have by themselves; C_b(u) = <y_b, T_u> / n;
+D(u) = |T_u|^2 / n; p = G q motion, q (6,) in pixels (motion_axes).
 
     S(p) = -sum_b w_b C_b(J_b p) / sqrt(sum_b w_b D(J_b p) + 0.1),    the lower the better
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
 from depth_deblur_ros.core.geometry import interaction_matrix
+from depth_deblur_ros.core.lanes import (
+    larger,
+    load,
+    pairs,
+    splat,
+    store,
+    where_positive,
+    whole,
+    WIDTH,
+)
+from depth_deblur_ros.core.templates import (
+    ACROSS,
+    BAND_COLUMNS,
+    HALF,
+    matches,
+    PATCH,
+    REACH,
+    template_table,
+)
 from numba import njit, prange
 import numpy as np
 import numpy.typing as npt
+from scipy import fft
 
-PATCH = 96  # px
 STEP = 48  # px between patches
-REACH = (
-    56  # px; longest flow of the table along each axis; longer blurs are seen at coarser scales
-)
-SECTORS = 24  # directions in which a scene may be strong or weak by itself
-BAND = (2.5 / PATCH, 0.25)  # cycles/px: above the window's own width, below the lens's blur
-FLOOR = 0.035  # how deep the dark bands are filled by noise and by neighbours in the window
 CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sensor
 EVEN = 0.1  # of S: keeps faint templates from winning by their small norm
 MAX_PATCHES = 400
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Templates of all flows, 1 px apart: rows v = 0..REACH, columns u = -REACH..REACH."""
-
-    bins: npt.NDArray[np.intp]  # (n,) flat indices into the half spectrum
-    nuisance: FloatImage  # (n, k) orthonormal
-    templates: FloatImage  # (n, rows * columns)
-    energy: FloatImage  # (rows, columns) D
+CHUNK = 256  # motions that are scored together
+SPARSE = 4  # every so many-th pixel of a patch tells its depth
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the patches of one scale say: C (B, rows, columns), D, w (B,), J G (B, 2, 6)."""
+    """What the patches of one scale say: C (B, rows, ACROSS), D, sag, w (B,), J G (B, 2, 6)."""
 
     match: FloatImage
     energy: FloatImage
-    weight: Vector
-    flow_of_q: Vector
-
-
-@lru_cache(maxsize=1)
-def template_table() -> Table:
-    """Compute the templates once per process."""
-    fy, fx = np.meshgrid(np.fft.fftfreq(PATCH), np.fft.rfftfreq(PATCH), indexing='ij')
-    r = np.hypot(fx, fy)
-    bins = np.flatnonzero((r > BAND[0]) & (r < BAND[1]))
-    sector = (np.arctan2(fy, fx) / np.pi * SECTORS).astype(int) % SECTORS
-    columns = [(sector.flat[bins] == k).astype(float) for k in range(SECTORS)]
-    columns += [np.log(r.flat[bins]), r.flat[bins] ** 2]
-    nuisance = np.linalg.qr(np.stack(columns, 1))[0].astype(np.float32)
-    us = np.arange(-REACH, REACH + 1, dtype=float)
-    rows = []
-    for v in range(REACH + 1):
-        rows.append(_templates(fx, fy, bins, us, float(v)))
-    t = np.concatenate(rows, 1)
-    t = (t - nuisance @ (nuisance.T @ t)).astype(np.float32)
-    energy = np.square(t).mean(0).reshape(REACH + 1, len(us))
-    return Table(bins, nuisance, t, energy.astype(np.float32))
-
-
-def _templates(
-    fx: Vector, fy: Vector, bins: npt.NDArray[np.intp], us: Vector, v: float
-) -> FloatImage:
-    """Give log-spectra (n, len(us)) of straight blurs (u, v), smeared by the window."""
-    spectra = np.sinc(fx[None] * us[:, None, None] + fy[None] * v) ** 2
-    # The half spectrum is continued by its mirror image: S(-f) = S(f).
-    left = np.roll(spectra[:, ::-1, 1:2], 1, axis=1)
-    wide = np.concatenate([left, spectra, spectra[:, :, -2:-1]], 2)
-    wide = (wide[:, :, :-2] + 4 * wide[:, :, 1:-1] + wide[:, :, 2:]) / 6
-    wide = (np.roll(wide, 1, 1) + 4 * wide + np.roll(wide, -1, 1)) / 6
-    logs = np.log(wide + FLOOR).reshape(len(us), -1)[:, bins]
-    return np.asarray(logs.T, np.float32)
+    sag: FloatImage
+    weight: FloatImage
+    flow_of_q: FloatImage
 
 
 def gather_evidence(
@@ -103,25 +72,48 @@ def gather_evidence(
     """
     table = template_table()
     corners = _corners(grey.shape)
-    gx, gy = _differences(grey)
-    window = np.outer(*[np.hanning(PATCH + 2)[1:-1].astype(np.float32)] * 2)
-    logs = np.empty((len(corners), len(table.bins)), np.float32)
-    weight = np.empty(len(corners))
-    for k, (y, x) in enumerate(corners):
-        cut = np.s_[y : y + PATCH, x : x + PATCH]
-        w = window * valid[cut]
-        power = np.abs(np.fft.rfft2(w * gx[cut])) ** 2 + np.abs(np.fft.rfft2(w * gy[cut])) ** 2
-        logs[k] = np.log(power.flat[table.bins] + 1e-12)
-        weight[k] = np.square(w * gx[cut]).mean() + np.square(w * gy[cut]).mean()
+    power, weight = _spectra(grey, valid, corners, table.bins)
+    logs = np.log(power + np.float32(1e-12))
     logs -= (logs @ table.nuisance) @ table.nuisance.T
     np.clip(logs, *CLIP, out=logs)
-    match = (logs @ table.templates) / np.float32(len(table.bins))
+    weight = weight**0.25
     return Evidence(
-        match.reshape(len(corners), *table.energy.shape),
+        matches(logs, table.templates),
         table.energy,
-        weight**0.25 / max(float((weight**0.25).sum()), 1e-12),  # all 0 where all is plain
-        _flow_of_q(corners, depth, camera, axes),
+        table.sag,
+        weight / max(float(weight.sum()), 1e-12),  # all 0 where all is plain
+        _flow_of_q(corners, depth, camera, axes).astype(np.float32),
     )
+
+
+def _spectra(
+    grey: FloatImage,
+    valid: FloatImage,
+    corners: list[tuple[int, int]],
+    bins: npt.NDArray[np.intp],
+) -> tuple[FloatImage, FloatImage]:
+    """
+    Give the gradients' spectrum (B, n) of each patch in the bins, and their mean square (B,).
+
+    Patches one above the other share the transforms of their common rows.
+    """
+    window = np.hanning(PATCH + 2)[1:-1].astype(np.float32)
+    power = np.zeros((len(corners), len(bins)), np.float32)
+    weight = np.zeros(len(corners), np.float32)
+    places = bins // HALF * BAND_COLUMNS + bins % HALF
+    ys, xs = np.array(corners).T
+    for difference in _differences(grey):
+        field = difference * valid
+        for x in np.unique(xs):
+            strip = window * field[:, x : x + PATCH]
+            square = np.square(strip).sum(1)
+            rows = fft.rfft(strip, axis=1)[:, :BAND_COLUMNS]
+            own = np.flatnonzero(xs == x)
+            cut = np.array([rows[y : y + PATCH] for y in ys[own]]) * window[:, None]
+            found = fft.fft(cut, axis=1, overwrite_x=True).reshape(len(own), -1)[:, places]
+            power[own] += found.real**2 + found.imag**2
+            weight[own] += [window**2 @ square[y : y + PATCH] for y in ys[own]]
+    return power, weight / np.float32(PATCH**2)
 
 
 def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -144,14 +136,13 @@ def _flow_of_q(
     corners: list[tuple[int, int]], depth: FloatImage, camera: CameraIntrinsics, axes: Vector
 ) -> Vector:
     """Give J_b G (B, 2, 6): the flow of each patch's middle, at the median depth there."""
-    quarter = PATCH // 4
     middle = np.array([(x + PATCH / 2 - 0.5, y + PATCH / 2 - 0.5) for y, x in corners])
-    inner = [
-        np.median(depth[y + quarter : y + 3 * quarter, x + quarter : x + 3 * quarter])
-        for y, x in corners
-    ]
-    j = interaction_matrix(middle[:, 0], middle[:, 1], np.array(inner, np.float64), camera)
-    return np.ascontiguousarray(j @ axes)
+    inner = np.arange(PATCH // 4, 3 * PATCH // 4, SPARSE)
+    ys, xs = np.array(corners).T[..., None, None] + inner
+    near = depth[ys.swapaxes(1, 2), xs].reshape(len(corners), -1)
+    own = np.median(near, axis=1).astype(np.float64)
+    j = interaction_matrix(middle[:, 0], middle[:, 1], own, camera)
+    return np.asarray(j @ axes)
 
 
 def motion_axes(depth: FloatImage, camera: CameraIntrinsics) -> Vector:
@@ -174,47 +165,71 @@ def motion_axes(depth: FloatImage, camera: CameraIntrinsics) -> Vector:
     return g
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _score(q, match, energy, weight, flow_of_q):  # type: ignore[no-untyped-def]
-    """S of one motion: bilinear look-up of C and D at each patch's flow."""
-    reach = energy.shape[0] - 1
-    c, d = 0.0, EVEN
-    for b in range(len(weight)):
-        u, v = 0.0, 0.0
-        for k in range(6):
-            u += flow_of_q[b, 0, k] * q[k]
-            v += flow_of_q[b, 1, k] * q[k]
-        if v < 0:
-            u, v = -u, -v
-        if abs(u) >= reach or v >= reach:
-            d += weight[b] * 1.0
-            continue
-        u += reach
-        x, y = int(u), int(v)
-        a, e = u - x, v - y
-        w00, w01, w10, w11 = (1 - a) * (1 - e), a * (1 - e), (1 - a) * e, a * e
-        m = match[b]
-        c += weight[b] * (
-            w00 * m[y, x] + w01 * m[y, x + 1] + w10 * m[y + 1, x] + w11 * m[y + 1, x + 1]
-        )
-        d += weight[b] * (
-            w00 * energy[y, x]
-            + w01 * energy[y, x + 1]
-            + w10 * energy[y + 1, x]
-            + w11 * energy[y + 1, x + 1]
-        )
-    return -c / np.sqrt(d)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _scores(qs, match, energy, weight, flow_of_q):  # type: ignore[no-untyped-def]
-    out = np.empty(len(qs))
-    for i in prange(len(qs)):
-        out[i] = _score(qs[i], match, energy, weight, flow_of_q)
-    return out
+def thinned(evidence: Evidence) -> Evidence:
+    """Give what every second patch says."""
+    e = evidence
+    match, weight, flow = (array[::2].copy() for array in (e.match, e.weight, e.flow_of_q))
+    return replace(e, match=match, weight=weight / max(weight.sum(), 1e-12), flow_of_q=flow)
 
 
 def scores(qs: Vector, evidence: Evidence) -> Vector:
     """Give S of the motions q (m, 6) [px]."""
-    e = evidence
-    return np.asarray(_scores(np.ascontiguousarray(qs), e.match, e.energy, e.weight, e.flow_of_q))
+    e, count = evidence, len(qs)
+    padded = np.zeros((6, -(-count // WIDTH) * WIDTH), np.float32)
+    padded[:, :count] = qs.T
+    c, d = np.zeros(padded.shape[1], np.float32), np.full(padded.shape[1], EVEN, np.float32)
+    match, flows = e.match.reshape(len(e.match), -1), e.flow_of_q.reshape(-1, 12)
+    table = (e.energy.reshape(-1), e.sag.reshape(-1))
+    _add_up(padded.reshape(-1), match, *table, e.weight, flows, c, d)
+    return np.asarray(-c[:count].astype(np.float64) / np.sqrt(d[:count]))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _flow(row, q, i, step):  # type: ignore[no-untyped-def]
+    """Give one row (6,) of J G times q, for sixteen motions from the i-th on."""
+    flow = splat(row[0]) * load(q, i)
+    flow += splat(row[1]) * load(q, i + step)
+    flow += splat(row[2]) * load(q, i + 2 * step)
+    flow += splat(row[3]) * load(q, i + 3 * step)
+    flow += splat(row[4]) * load(q, i + 4 * step)
+    return flow + splat(row[5]) * load(q, i + 5 * step)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _between(table, p, w):  # type: ignore[no-untyped-def]
+    """Look up sixteen cells, bilinear weights w."""
+    here, right = pairs(table, p)
+    below, beyond = pairs(table, p + splat(np.float32(ACROSS)))
+    return w[0] * here + w[1] * right + w[2] * below + w[3] * beyond
+
+
+@njit(cache=True, nogil=True)
+def _add_patch(first, end, q, match, energy, sag, weight, flow, c, d):  # type: ignore[no-untyped-def]
+    """Add what one patch says about motions `first` to `end` to c and d."""
+    zero, one, reach = splat(np.float32(0)), splat(np.float32(1)), splat(np.float32(REACH))
+    w = splat(weight)
+    for i in range(first, end, WIDTH):
+        u, v = _flow(flow[:6], q, i, c.size), _flow(flow[6:], q, i, c.size)
+        u, v = where_positive(v, u, zero - u), larger(v, zero - v)
+        inside = reach - larger(v, larger(u, zero - u))
+        u, v = where_positive(inside, u + reach, zero), where_positive(inside, v, zero)
+        x, y = whole(u), whole(v)
+        a, b = u - x, v - y
+        both = a * b
+        corners = (one - a - b + both, a - both, b - both, both)
+        place = x + y * splat(np.float32(ACROSS))
+        along, down = pairs(sag, place + place)
+        own = _between(energy, place, corners) - a * (one - a) * along - b * (one - b) * down
+        found = where_positive(inside, w * _between(match, place, corners), zero)
+        store(c, i, load(c, i) + found)
+        # A flow beyond the table costs.
+        store(d, i, load(d, i) + w * where_positive(inside, own, one))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _add_up(q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
+    """Add the patches' C and D at motions q (6 * m,) to c and d (m,); all flat but B first."""
+    for k in prange(-(-c.size // CHUNK)):
+        end = min((k + 1) * CHUNK, c.size)
+        for b in range(len(weight)):
+            _add_patch(k * CHUNK, end, q, match[b], energy, sag, weight[b], flows[b], c, d)

@@ -9,6 +9,7 @@ R. Soc. B 208, 1980: the first-order flow, (3) of docs/method.md.
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
@@ -16,6 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+ENOUGH = 20_000  # pixels that tell the mean length of a blur
 
 
 def normalised_grid(camera: CameraIntrinsics) -> tuple[Array, Array]:
@@ -89,6 +92,11 @@ def warp(
 def blur_length(
     p: npt.ArrayLike, depth: npt.NDArray[np.floating], camera: CameraIntrinsics
 ) -> float:
-    """Give the mean length [px] of the flow over the exposure."""
-    f = flow(p, depth, camera)
-    return float(np.hypot(f[..., 0], f[..., 1]).mean())
+    """Give the mean length [px] of the flow over the exposure, of ENOUGH pixels or more."""
+    step = max(1, math.isqrt(depth.size // ENOUGH))
+    some = depth[::step, ::step]
+    height, width = some.shape
+    fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    sparse = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+    f = flow(p, some, sparse)
+    return step * float(np.hypot(f[..., 0], f[..., 1]).mean())

@@ -15,7 +15,9 @@ from typing import Any
 
 from llvmlite import ir
 from numba import njit, types
-from numba.extending import intrinsic, models, overload, register_model
+from numba.core import cgutils
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
 import numpy as np
 
 WIDTH = 16
@@ -104,6 +106,62 @@ def last_lane(typing: Any, lanes: Any) -> Any:
     return types.float32(LANES), build
 
 
+@_instruction  # type: ignore[untyped-decorator]
+def pairs(typing: Any, array: Any, places: Any) -> Any:
+    """Read the elements i and i + 1 for sixteen i, whole numbers >= 0 as float32: two lanes."""
+    both = types.UniTuple(LANES, 2)  # type: ignore[no-untyped-call]
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        flat = context.make_array(signature.args[0])(context, builder, value=values[0])
+        long = ir.VectorType(ir.IntType(64), WIDTH)
+        first = builder.ptrtoint(flat.data, ir.IntType(64))
+        first = builder.insert_element(ir.Constant(long, ir.Undefined), first, _INDEX(0))
+        first = builder.shuffle_vector(first, first, _order([0] * WIDTH))
+        bytes_on = builder.mul(builder.fptosi(values[1], long), ir.Constant(long, [4] * WIDTH))
+        addresses = builder.inttoptr(
+            builder.add(first, bytes_on), ir.VectorType(ir.DoubleType().as_pointer(), WIDTH)
+        )
+        kind = ir.VectorType(ir.DoubleType(), WIDTH)  # two float32 in one read
+        mask = ir.Constant(ir.VectorType(ir.IntType(1), WIDTH), [True] * WIDTH)
+        name = f'llvm.masked.gather.v{WIDTH}f64.v{WIDTH}p0'
+        arguments = [addresses, _INDEX(4), mask, ir.Constant(kind, ir.Undefined)]
+        gather = ir.FunctionType(kind, [value.type for value in arguments])
+        function = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, gather, name
+        )
+        found = builder.call(function, arguments)
+        found = builder.bitcast(found, ir.VectorType(ir.FloatType(), 2 * WIDTH))
+        halves = [
+            builder.shuffle_vector(found, found, _order(list(range(k, 2 * WIDTH, 2))))
+            for k in (0, 1)
+        ]
+        return context.make_tuple(builder, both, halves)
+
+    return (both(array, LANES), build) if _fits(array) else None
+
+
+@_instruction  # type: ignore[untyped-decorator]
+def whole(typing: Any, lanes: Any) -> Any:
+    """Cut off what follows the point."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        numbers = builder.fptosi(values[0], ir.VectorType(_INDEX, WIDTH))
+        return builder.sitofp(numbers, _VECTOR)
+
+    return LANES(LANES), build
+
+
+@_instruction  # type: ignore[untyped-decorator]
+def where_positive(typing: Any, sign: Any, a: Any, b: Any) -> Any:
+    """Give a where sign > 0, else b."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        zeros = ir.Constant(_VECTOR, [0.0] * WIDTH)
+        return builder.select(builder.fcmp_ordered('>', values[0], zeros), *values[1:])
+
+    return LANES(LANES, LANES, LANES), build
+
+
 def _order(places: list[int]) -> Any:
     return ir.Constant(ir.VectorType(_INDEX, WIDTH), places)
 
@@ -122,28 +180,30 @@ def _of_two(calculate: Callable[[Any, Any, Any], Any]) -> Any:
 
 
 FAST = ('fast',)  # lets a * b + c become one instruction
-_add = _of_two(lambda builder, a, b: builder.fadd(a, b, flags=FAST))
-_subtract = _of_two(lambda builder, a, b: builder.fsub(a, b, flags=FAST))
-_multiply = _of_two(lambda builder, a, b: builder.fmul(a, b, flags=FAST))
 larger = _of_two(lambda builder, a, b: builder.select(builder.fcmp_ordered('>', a, b), a, b))
 smaller = _of_two(lambda builder, a, b: builder.select(builder.fcmp_ordered('<', a, b), a, b))
 
 
-def _stands_for(sign: Any, function: Any) -> None:
-    """Let a sign between two lanes mean a function of them."""
+def _stands_for(sign: Any, instruction: str) -> None:
+    """Let a sign between two lanes mean an instruction."""
 
-    @overload(sign)
-    def choose(a, b):  # type: ignore[no-untyped-def]
-        def both(a, b):  # type: ignore[no-untyped-def]
-            return function(a, b)
+    def generic(self: Any, kinds: Any, _: Any) -> Any:
+        if kinds != (LANES, LANES):
+            return None
+        return signature(LANES, LANES, LANES)  # type: ignore[no-untyped-call]
 
-        return both if isinstance(a, Lanes) and isinstance(b, Lanes) else None
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return getattr(builder, instruction)(*values, flags=FAST)
+
+    chosen = type(instruction, (AbstractTemplate,), {'generic': generic})
+    infer_global(sign)(chosen)  # type: ignore[no-untyped-call]
+    lower_builtin(sign, Lanes, Lanes)(build)  # type: ignore[no-untyped-call]
 
 
-_stands_for(operator.add, _add)
-_stands_for(operator.iadd, _add)
-_stands_for(operator.sub, _subtract)
-_stands_for(operator.mul, _multiply)
+_stands_for(operator.add, 'fadd')
+_stands_for(operator.iadd, 'fadd')
+_stands_for(operator.sub, 'fsub')
+_stands_for(operator.mul, 'fmul')
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -125,7 +125,9 @@ def _colour(image: FloatImage) -> FloatImage:
 
 
 def _grey(image: FloatImage) -> FloatImage:
-    return image if image.ndim == 2 else image.mean(2)
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.transform(image, np.full((1, 3), 1 / 3, np.float32)), np.float32)
 
 
 @contextmanager

@@ -20,11 +20,11 @@ from depth_deblur_ros.core.evidence import (
     Evidence,
     gather_evidence,
     motion_axes,
-    PATCH,
-    REACH,
     scores,
+    thinned,
 )
 from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.templates import PATCH, REACH
 from depth_deblur_ros.core.trust import covariance_from_curvature, sharpness
 import numpy as np
 
@@ -36,6 +36,8 @@ SHARE = {
 }  # of a scale in the common score: coarse bands are deep but inexact
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
 FEW = 4  # patches; a coarse scale with less has no vote
+MANY = 40  # patches of a scale, of which half are heard on all proposals
+HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that all patches judge; that seeds are of
 SEEDS = 8  # distinct motions that each scale refines
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
@@ -178,9 +180,8 @@ def _search(scales: list[Scale], guesses: list[Vector]) -> Vector:
     """Let each scale propose and all choose; q (6,)."""
     found = list(guesses)
     for scale in scales:
-        for seed in _seeds(scale):
-            found.append(_refine(seed, [scale], 2.0 * scale.factor))
-    return _refine(_choose(np.array(found), scales), scales, 1.0)
+        found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor))
+    return np.asarray(_refine(_choose(np.array(found), scales)[None], scales, 1.0)[0])
 
 
 def _choose(qs: Vector, scales: list[Scale]) -> Vector:
@@ -204,29 +205,41 @@ def _proposals() -> Vector:
     return np.concatenate([grid, random])
 
 
-def _seeds(scale: Scale) -> list[Vector]:
-    """Pick the best proposals of a scale that differ by more than 4 of its pixels."""
-    qs = _proposals() * scale.factor
-    order = np.argsort(common_score(qs, [scale]))[:3000]
+def _seeds(scale: Scale) -> Vector:
+    """Pick the best proposals (n, 6) of a scale that differ by more than 4 of its pixels."""
+    qs = scale.factor * _proposals()
+    if len(scale.evidence.weight) >= MANY:
+        qs = _best(qs, Scale(scale.factor, thinned(scale.evidence)), HEARD_TWICE)
+    qs = _best(qs, scale, CANDIDATES)
     chosen: list[Vector] = []
-    for k in order:
-        if all(np.abs(qs[k] - other).max() > 4 * scale.factor for other in chosen):
-            chosen.append(qs[k])
-        if len(chosen) == SEEDS:
-            break
-    return chosen
+    while len(qs) and len(chosen) < SEEDS:
+        chosen.append(qs[0])
+        qs = qs[np.abs(qs - qs[0]).max(1) > 4 * scale.factor]
+    return np.array(chosen)
 
 
-def _refine(q: Vector, scales: list[Scale], radius: float) -> Vector:
-    """Shrinking random search around q, the same each time; radius [px]."""
-    rng = np.random.default_rng(0)
-    spread = radius * np.array(SPREAD)
-    best = common_score(q[None], scales)[0]
-    for _ in range(ROUNDS):
-        tries = q + rng.standard_normal((TRIES, 6)) * spread
-        values = common_score(tries, scales)
-        k = int(np.argmin(values))
-        if values[k] < best:
-            best, q = values[k], tries[k]
-        spread = SHRINK * spread
-    return q
+def _best(qs: Vector, scale: Scale, count: int) -> Vector:
+    """Give the motions that a scale likes best, the best first."""
+    values = common_score(qs, [scale])
+    some = np.argpartition(values, count)[:count] if count < len(qs) else np.arange(len(qs))
+    return np.asarray(qs[some[np.argsort(values[some], kind='stable')]])
+
+
+@lru_cache(maxsize=1)
+def _steps() -> Vector:
+    """Give the steps (ROUNDS, TRIES, 6) of the shrinking search, in units of its radius."""
+    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 6)) * SPREAD
+    return np.asarray(steps * SHRINK ** np.arange(ROUNDS)[:, None, None])
+
+
+def _refine(qs: Vector, scales: list[Scale], radius: float) -> Vector:
+    """Shrinking random search around each of qs (n, 6), the same each time; radius [px]."""
+    best, each = common_score(qs, scales), np.arange(len(qs))
+    for steps in _steps():
+        tries = qs[:, None] + radius * steps
+        values = common_score(tries.reshape(-1, 6), scales).reshape(len(qs), -1)
+        k = np.argmin(values, 1)
+        better = values[each, k] < best
+        best = np.where(better, values[each, k], best)
+        qs = np.where(better[:, None], tries[each, k], qs)
+    return qs
