@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, RgbdFrame, Vector
 from depth_deblur_ros.core.geometry import interaction_matrix
+from depth_deblur_ros.glide import Way
 import numpy as np
 import numpy.typing as npt
 
@@ -25,6 +26,8 @@ THERE_AND_BACK = 0.7  # px; a track that does not come back is none
 SAME_SURFACE = 0.15  # relative depth between both ends of a track
 ROUNDS = 12
 FINEST = 0.2  # px; no track is better than this
+EVERY = 10  # px; of the pixels that stand for all
+ROLL_RIDGE = 40.0  # px^2/rad^2; keeps what nothing tells of a rolling shutter near zero
 CUT = 4.0  # standard deviations; what is farther off does not count
 FEWEST, LEAST_SHARE = 20, 0.4  # of the tracks must agree
 OPTIMISM = 9.0  # times variance: errors of tracks are alike, the more so the larger they are
@@ -41,10 +44,33 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Between:
-    """The motion (6,) over the time between two frames, as Motion tells it, and (6, 6)."""
+    """
+    The motion (6,) over the time between two frames, as Motion tells it, with what else was seen.
 
-    motion: Vector
+    found (9,): that motion, and by how much the turn of the last row differs from that of the
+    first, as a rolling shutter makes it; covariance (9, 9). stretch (9, 6), skew (9, 6): what a
+    shutter that reads all rows within one interval makes of the motion, and of its change, (46).
+    """
+
+    found: Vector
     covariance: Vector
+    stretch: Vector
+    skew: Vector
+
+    @property
+    def motion(self) -> Vector:
+        """Give the motion (6,) alone."""
+        return self.found[:6]
+
+    def way(self, seconds: float, readout: float, doubt: float) -> Way:
+        """Give it as a way of so many seconds, uncertain by a share; readout [s] of all rows."""
+        look = np.eye(9, 12)
+        look[6:] = 0
+        look[:, :6] += readout / seconds * self.stretch
+        look[:, 6:] += readout * seconds * self.skew
+        covariance = self.covariance.copy()
+        covariance[:6, :6] += doubt**2 * np.outer(self.motion, self.motion)
+        return Way(self.found, covariance, look)
 
 
 def view_of(frame: RgbdFrame) -> View:
@@ -78,7 +104,21 @@ def motion_between(first: View, second: View) -> Between | None:
     if len(flow) < FEWEST:
         return None
     j = interaction_matrix(middle[:, 0], middle[:, 1], depth[good], first.camera)
-    return _fit(j, flow)
+    height = first.camera.height
+    return _fit(j, flow, (middle[:, 1] - first.camera.cy) / height, height)
+
+
+def row_skew(view: View) -> Vector:
+    """Give the (6, 6) of which a rolling shutter's blur has too much, as Between.skew."""
+    y, x = np.mgrid[: view.camera.height : EVERY, : view.camera.width : EVERY].reshape(2, -1)
+    depth = view.depth[y, x].astype(np.float64)
+    seen = depth > 0
+    if seen.sum() < FEWEST:
+        return np.zeros((6, 6))
+    j = interaction_matrix(x[seen], y[seen], depth[seen], view.camera)
+    row = (y[seen] - view.camera.cy) / view.camera.height
+    late = np.einsum('n,nij,nik->jk', row, j, j)
+    return np.linalg.solve(np.einsum('nij,nik->jk', j, j) + 1e-9 * np.eye(6), late)
 
 
 def _tracks(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[Vector, Vector]:
@@ -115,21 +155,32 @@ def _depth_at(depth: FloatImage, points: Vector) -> Vector:
     return found
 
 
-def _fit(j: Vector, flow: Vector) -> Between | None:
-    """Fit a motion (6,) to flow (n, 2) = J p by reweighted least squares, (41), (42)."""
+def _fit(j: Vector, flow: Vector, row: Vector, height: int) -> Between | None:
+    """
+    Fit a motion (6,) to flow (n, 2) = J p by reweighted least squares, (41), (42), (46).
+
+    row (n,): of each track, in heights of the picture [px] from the optical axis.
+    """
+    late = row[:, None, None] * j
+    both = np.concatenate([j, late[:, :, :3]], 2)
     weight = np.ones(len(flow))
-    spread, ridge = FINEST, 1e-9 * np.eye(6)
+    spread, ridge = FINEST, np.diag([1e-9] * 6 + [ROLL_RIDGE] * 3)
     for _ in range(ROUNDS):
-        weighted = weight[:, None, None] * j
-        information = np.einsum('nij,nik->jk', weighted, j)
+        weighted = weight[:, None, None] * both
+        information = np.einsum('nij,nik->jk', weighted, both) + ridge
         if weight.sum() < 6:
             return None
-        p = np.linalg.solve(information + ridge, np.einsum('nij,ni->j', weighted, flow))
-        miss = np.linalg.norm(flow - j @ p, axis=1)
+        p = np.linalg.solve(information, np.einsum('nij,ni->j', weighted, flow))
+        miss = np.linalg.norm(flow - both @ p, axis=1)
         spread = max(FINEST, 1.25 * float(np.median(miss)))
         weight = np.square(np.clip(1 - np.square(miss / (CUT * spread)), 0, None))
     agree = weight > 0
     if agree.sum() < FEWEST or agree.mean() < LEAST_SHARE:
         return None
     doubt = OPTIMISM * (spread / FINEST) * spread**2
-    return Between(p, doubt * np.linalg.inv(information + ridge))
+    inverse = np.linalg.inv(information)
+    stretch, skew = (
+        inverse @ np.einsum('nij,nik->jk', weighted, by)
+        for by in (flow[:, 1, None, None] / height * j, late)
+    )
+    return Between(p, doubt * inverse, stretch, skew)

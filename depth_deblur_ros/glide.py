@@ -10,6 +10,7 @@ docs/method.md (43) to (45). Motion over an exposure T is T u.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 import math
 
 from depth_deblur_ros.core.data import Vector
@@ -20,7 +21,22 @@ RESTLESS = np.array([16.0, 5.0])  # rad/s^2, m/s^2; of a hand that shakes
 CALMEST, WILDEST = RESTLESS / 2, 4 * RESTLESS
 CALM_DOWN, STIR_UP = 0.1, 0.3  # powers of how far a way missed the expected one
 FAST = np.repeat([3.0, 1.5], 3)  # rad/s, m/s; what a velocity may be before anything is seen
+ENDS = np.r_[:6, 18:24]  # what a way shows of (c, u, a, b)
 POINTS = 16  # of the integral for the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """
+    What was measured from one frame to the next, (n,), and its covariance (n, n).
+
+    look (n, 12): it is look @ (c, b), of the way c and the mean acceleration b meanwhile; the
+    first six are c but for a rolling shutter.
+    """
+
+    motion: Vector
+    covariance: Vector
+    look: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,29 +57,38 @@ class Glide:
         """Give the covariance (6, 6) of u."""
         return self.covariance[:6, :6]
 
-    def measured(self, velocity: Vector, covariance: Vector) -> Glide:
-        """Take a measured velocity (6,) with its covariance (6, 6) in."""
-        look = np.eye(6, 12)
-        return self._updated(look, velocity - self.velocity, covariance)
+    def measured(self, velocity: Vector, covariance: Vector, look: Vector | None = None) -> Glide:
+        """Take in a measured velocity (6,), look (6, 12) @ (u, a), with its covariance (6, 6)."""
+        look = np.eye(6, 12) if look is None else look
+        return self._updated(look, velocity - look @ self.mean, covariance)
 
-    def moved(self, seconds: float, way: Vector | None, covariance: Vector | None) -> Glide:
-        """Go on in time, over a way (6,) that was measured or not."""
+    def moved(self, seconds: float, way: Way | None) -> Glide:
+        """Go on in time, over a way that was measured or not."""
+        return self.foreseen(seconds, way)[0]
+
+    def foreseen(self, seconds: float, way: Way | None) -> tuple[Glide, float]:
+        """Go on in time as moved; give also the log-likelihood of the way."""
         go, noise = _steps(seconds, self.unrest)
         mean, spread = go @ self.mean, go @ self.covariance @ go.T + noise
-        unrest = self.unrest
-        if way is not None and covariance is not None:
-            miss, expected = way - mean[:6], spread[:6, :6] + covariance
+        unrest, likely = self.unrest, 0.0
+        if way is not None:
+            look = np.zeros((len(way.motion), 24))
+            look[:, ENDS] = way.look
+            seen = spread @ look.T
+            miss, expected = way.motion - look @ mean, look @ seen + way.covariance
+            off = float(miss @ np.linalg.solve(expected, miss))
+            likely = -(off + float(np.linalg.slogdet(expected)[1])) / 2
             unrest = _stirred(unrest, miss, expected)
-            gain = spread[:, :6] @ np.linalg.inv(expected)
-            mean = mean + gain @ miss
-            spread = spread - gain @ spread[:6]
-        return Glide(mean[6:], _even(spread[6:, 6:]), unrest)
+            gain = seen @ np.linalg.inv(expected)
+            mean, spread = mean + gain @ miss, spread - gain @ seen.T
+        return Glide(mean[6:18], _even(spread[6:18, 6:18]), unrest), likely
 
-    def before(self, seconds: float, way: Vector, covariance: Vector) -> Glide:
-        """Learn about now from the way (6,) that will be gone in the time ahead [RTS65]."""
+    def before(self, seconds: float, way: Way) -> Glide:
+        """Learn about now from the way that will be gone in the time ahead [RTS65]."""
         go, noise = _steps(seconds, self.unrest)
-        look = go[:6]
-        return self._updated(look, way - look @ self.mean, covariance + noise[:6, :6])
+        rest = way.look @ noise[np.ix_(ENDS, ENDS)] @ way.look.T
+        look = way.look @ go[ENDS]
+        return self._updated(look, way.motion - look @ self.mean, way.covariance + rest)
 
     def _updated(self, look: Vector, miss: Vector, covariance: Vector) -> Glide:
         seen = self.covariance @ look.T
@@ -88,14 +113,22 @@ def _stirred(unrest: Vector, miss: Vector, expected: Vector) -> Vector:
 
 
 def _steps(seconds: float, unrest: Vector) -> tuple[Vector, Vector]:
-    """Give what takes (u, a) to (c, u, a) `seconds` later, (18, 12), and its noise (18, 18)."""
+    """Give what takes (u, a) to (c, u, a, b) `seconds` later, (24, 12), and its noise (24, 24)."""
+    go, effect = _effects(seconds)
+    size = np.diag(np.repeat(unrest**2, 3))
+    return go, (effect[:, None, :, None] * size[:, None, :]).reshape(24, 24)
+
+
+@lru_cache(maxsize=16)
+def _effects(seconds: float) -> tuple[Vector, Vector]:
+    """Give what takes (u, a) on, (24, 12), and the noise of one axis of unrest 1, (4, 4)."""
     way, speed, keep = _effect(seconds)
-    eye, zero = np.eye(6), np.zeros((6, 6))
-    go = np.block([[seconds * eye, way * eye], [eye, speed * eye], [zero, keep * eye]])
+    parts = np.array([[seconds, way], [1, speed], [0, keep], [0, speed / seconds]])
     times = (np.arange(POINTS) + 0.5) * seconds / POINTS
     effect = np.array([_effect(float(t)) for t in times])
+    effect = np.c_[effect, effect[:, 1] / seconds]
     noise = 2 / MEMORY * seconds / POINTS * effect.T @ effect
-    return go, np.kron(noise, np.diag(np.repeat(unrest**2, 3)))
+    return np.kron(parts, np.eye(6)), noise
 
 
 def _effect(seconds: float) -> tuple[float, float, float]:

@@ -36,13 +36,19 @@ WORD = 0.5  # quality of a motion that only the neighbours tell
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What the neighbours tell: velocity, exposure, frame interval [s], and whether they saw."""
+    """
+    What the neighbours tell: velocity, exposure, frame interval [s], and whether they saw.
+
+    look (6, 12): a blur shows look @ (velocity, acceleration), more than the velocity where the
+    shutter rolls.
+    """
 
     glide: Glide
     shutter: Shutter
     told: Exposure | None
     interval: float
     seen: bool
+    look: Vector
     now: Exposure | None = None  # of this frame alone, where it differs from the shutter's
 
     @property
@@ -55,17 +61,30 @@ class Context:
         if not self.seen:
             return None
         seconds = self.exposure.seconds if self.exposure else GUESS * self.interval
-        spread = seconds**2 * self.glide.spread
-        return Motion.from_vector(seconds * self.glide.velocity, spread)
+        return self.blur(seconds)
+
+    def over(self, seconds: float) -> tuple[Vector, Vector]:
+        """Give the motion (6,) over a time, and its covariance (6, 6)."""
+        return seconds * self.glide.velocity, seconds**2 * self.glide.spread
+
+    def blur(self, seconds: float) -> Motion:
+        """Give the motion that the blur of an exposure shows."""
+        spread = seconds**2 * self.look @ self.glide.covariance @ self.look.T
+        return Motion.from_vector(seconds * self.look @ self.glide.mean, spread)
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """A frame's result and exposure, and what its blur tells of the shutter and the velocity."""
+    """
+    A frame's result and exposure, and what its blur tells of the shutter and the velocity.
+
+    seen: the motion that its blur shows.
+    """
 
     result: DeblurResult
     exposure: Exposure | None
     shutter: Shutter
+    seen: Motion | None = None
     velocity: tuple[Vector, Vector] | None = None  # (6,) and (6, 6)
 
 
@@ -74,13 +93,12 @@ def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Jo
     if result.sign_resolved or not context.seen:
         return Joined(result, context.exposure, context.shutter)
     if result.outcome is not Outcome.SOLVED:
-        context = _shortened(result, context, camera)
-        return Joined(_claimed(result, context, camera), context.exposure, context.shutter)
+        return _claimed(result, _shortened(result, context, camera), camera)
     axes = motion_axes(result.depth, camera)
     covariance = REAL * result.motion.covariance + FLOOR_PX**2 * axes @ axes.T
     found = _measured(result.motion.vector, covariance, context)
     if found is None:
-        return Joined(_claimed(result, context, camera), context.exposure, context.shutter)
+        return _claimed(result, context, camera)
     motion = math.copysign(1, found.seconds) * result.motion.vector
     doubt = math.hypot(found.doubt, INEXACT_PX / result.blur_px)
     length = Exposure(abs(found.seconds), doubt)
@@ -91,10 +109,10 @@ def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Jo
         return Joined(_signed(result, motion, result.motion.covariance), exposure, shutter)
     along = np.outer(motion, motion) * exposure.doubt**2
     velocity = (motion / exposure.seconds, (covariance + along) / exposure.seconds**2)
-    glide = context.glide.measured(*velocity)
-    p, spread = exposure.seconds * glide.velocity, exposure.seconds**2 * glide.spread
+    context = replace(context, glide=context.glide.measured(*velocity, context.look))
+    p, spread = context.over(exposure.seconds)
     joined = replace(_signed(result, p, spread), blur_px=blur_length(p, result.depth, camera))
-    return Joined(joined, exposure, shutter, velocity)
+    return Joined(joined, exposure, shutter, context.blur(exposure.seconds), velocity)
 
 
 def _shortened(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Context:
@@ -114,9 +132,9 @@ def _shortened(result: DeblurResult, context: Context, camera: CameraIntrinsics)
 
 def _measured(p: Vector, covariance: Vector, context: Context) -> Exposure | None:
     """Give T of p = T u, negative where p is the reverse; None where they do not match, (47)."""
-    u, known = context.glide.velocity, context.exposure
-    seconds = known.seconds if known else GUESS * context.interval
-    weight = np.linalg.inv(covariance + seconds**2 * context.glide.spread)
+    known, shown = context.exposure, context.blur(1.0)
+    seconds, u = known.seconds if known else GUESS * context.interval, shown.vector
+    weight = np.linalg.inv(covariance + seconds**2 * shown.covariance)
     information = float(u @ weight @ u)
     length = float(p @ weight @ u) / max(information, TINY)
     miss = p - length * u
@@ -133,18 +151,19 @@ def _signed(result: DeblurResult, p: Vector, covariance: Vector) -> DeblurResult
     return replace(result, motion=Motion.from_vector(p, covariance), sign_resolved=True)
 
 
-def _claimed(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> DeblurResult:
+def _claimed(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Joined:
     """Give a frame that shows no motion by itself the one its neighbours tell, if any, (53)."""
     exposure = context.exposure
+    unclaimed = Joined(result, exposure, context.shutter)
     if exposure is None or exposure.doubt > VAGUE:
-        return result
-    p = exposure.seconds * context.glide.velocity
-    covariance = exposure.seconds**2 * context.glide.spread
+        return unclaimed
+    p, covariance = context.over(exposure.seconds)
     blur_px = blur_length(p, result.depth, camera)
     most = CLAIM_PX if result.outcome is Outcome.SHARP else math.inf
     sure = float(p @ np.linalg.solve(covariance, p)) > CLEAR
     if not (sure and VISIBLE_PX <= blur_px <= most):
-        return result
+        return unclaimed
     covariance = covariance + exposure.doubt**2 * np.outer(p, p)
     claimed = replace(result, outcome=Outcome.SOLVED, quality=WORD, blur_px=blur_px)
-    return _signed(claimed, p, covariance)
+    seen = context.blur(exposure.seconds)
+    return Joined(_signed(claimed, p, covariance), exposure, context.shutter, seen)

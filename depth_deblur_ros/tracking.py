@@ -4,7 +4,8 @@ What one frame tells the next: the sign of the motion, the exposure, where to st
 The same for a recording, which may look one frame ahead, and for a live camera, which may not.
 A frame goes through these steps, docs/method.md (40) to (53):
 1 between.py: the motion from the last frame to this one, and on to the following one if known
-2 glide.py: these and the past give the velocity u at this frame, with its covariance
+2 glide.py: these and the past give the velocity u at this frame, with its covariance, seen
+  through a shutter that may roll and stamps that may jitter (habits.py, cadence.py)
 3 the solver finds the motion p in the blur, u times the exposure being a further start
 4 joining.py: p against u tells the sign, and the exposure where nobody does (shutter.py); both
   together are the motion; the image is restored anew where that is another one
@@ -12,27 +13,26 @@ A frame goes through these steps, docs/method.md (40) to (53):
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
-import statistics
+import math
 import time
 from typing import Any, Protocol, runtime_checkable
 
-from depth_deblur_ros.between import Between, motion_between, View, view_of
+from depth_deblur_ros.between import Between, motion_between, row_skew, View, view_of
+from depth_deblur_ros.cadence import Cadence
 from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
-from depth_deblur_ros.glide import unknown_glide
+from depth_deblur_ros.glide import unknown_glide, Way
 from depth_deblur_ros.gyro import Gyro
-from depth_deblur_ros.joining import Context, GUESS, join
+from depth_deblur_ros.habits import Habits
+from depth_deblur_ros.joining import Context, GUESS, join, Joined
 from depth_deblur_ros.shutter import Exposure, Shutter
 import numpy as np
 
 GAP_S = 0.25  # frames farther apart are not neighbours
-USUAL_S = 1 / 30  # frame interval before any is seen
 OTHER_PX = 1.0  # px; motions less apart than this give the same image
-REMEMBERED = 31  # frame intervals that tell how even the stamps are
 
 
 class Solver(Protocol):
@@ -69,7 +69,7 @@ class Seen:
 
     view: View
     stamp_ns: int
-    way: Between | None
+    between: Between | None
     seconds: float | None  # since the one before; None where they are not neighbours
 
 
@@ -83,11 +83,11 @@ class Tracker:
         self._shutter = Shutter()
         self._last: Seen | None = None
         self._ahead: Seen | None = None
-        self._intervals: deque[float] = deque(maxlen=REMEMBERED)
+        self._cadence, self._habits = Cadence(), Habits()
 
     def state(self) -> Any:
         """Give all that is remembered, as something that can be pickled."""
-        frames = (self._last, self._ahead, list(self._intervals))
+        frames = (self._last, self._ahead, self._cadence, self._habits)
         own = (self._glide, self._shutter, frames, self.gyro.trial)
         return own, self._solve.state() if isinstance(self._solve, Memory) else None
 
@@ -95,8 +95,7 @@ class Tracker:
         """Remember this, and nothing else."""
         own, inner = state
         self._glide, self._shutter, frames, self.gyro.trial = own
-        self._last, self._ahead, intervals = frames
-        self._intervals = deque(intervals, maxlen=REMEMBERED)
+        self._last, self._ahead, self._cadence, self._habits = frames
         if isinstance(self._solve, Memory):
             self._solve.restore(inner)
 
@@ -118,8 +117,8 @@ class Tracker:
         joined = join(alone, context, frame.camera)
         self._shutter = joined.shutter
         if joined.velocity:
-            self._glide = self._glide.measured(*joined.velocity)
-        result = self._restored(frame, params, alone, joined.result)
+            self._glide = self._glide.measured(*joined.velocity, context.look)
+        result = self._restored(frame, params, alone, joined)
         return Tracked(replace(result, seconds=result.seconds + spent), joined.exposure)
 
     def _context(
@@ -131,13 +130,15 @@ class Tracker:
     ) -> Context:
         """Go on to a frame, look at the following one, ask the gyro."""
         seen = self._arrive(frame, params)
-        glide, known = self._glide, seen.way is not None
+        glide, known = self._glide, seen.between is not None
         self._ahead = self._seen(following, seen) if following else None
-        if self._ahead and self._ahead.way and self._ahead.seconds:
-            way = self._uneven(self._ahead.way, self._ahead.seconds)
-            glide = glide.before(self._ahead.seconds, way.motion, way.covariance)
+        if self._ahead and self._ahead.between and self._ahead.seconds:
+            cadence = self._cadence.later(self._ahead.seconds)
+            glide = glide.before(*self._way(self._ahead.between, cadence))
             known = True
-        context = Context(glide, self._shutter, told, self._interval(), known)
+        look = np.eye(6, 12)
+        look[:, 6:] = self._habits.readout * self._cadence.usual * row_skew(seen.view)
+        context = Context(glide, self._shutter, told, self._cadence.usual, known, look)
         return self._turned(frame.stamp_ns, context, params)
 
     def _turned(self, stamp_ns: int, context: Context, params: SolverParams) -> Context:
@@ -156,18 +157,18 @@ class Tracker:
             seen = self._seen(frame, self._last)
         self._last, self._ahead = seen, None
         if seen.seconds is None:
-            self._glide = unknown_glide()
+            self._glide, self._habits = unknown_glide(), self._habits.parted()
             self._shutter = self._shutter.later(gap=True)
             return seen
-        self._intervals.append(seen.seconds)
+        self._cadence = self._cadence.later(seen.seconds)
+        self._habits = self._habits.moved(self._cadence, seen.between)
         self._shutter = self._shutter.later()
-        if seen.way:
-            way = self._uneven(seen.way, seen.seconds)
-            self._glide = self._glide.moved(seen.seconds, way.motion, way.covariance)
-        else:
-            self._glide = self._glide.moved(seen.seconds, None, None)
-        first_ns = frame.stamp_ns - round(1e9 * seen.seconds)
-        self.gyro.compare(first_ns, seen.way, seen.seconds, params)
+        seconds, way = self._seconds(self._cadence)[0], None
+        if seen.between:
+            seconds, way = self._way(seen.between, self._cadence)
+        self._glide = self._glide.moved(seconds, way)
+        first_ns = frame.stamp_ns - round(1e9 * seconds)
+        self.gyro.compare(first_ns, seen.between, seconds, params)
         return seen
 
     def _seen(self, frame: RgbdFrame, before: Seen | None) -> Seen:
@@ -178,32 +179,34 @@ class Tracker:
             way = motion_between(before.view, view)
         return Seen(view, frame.stamp_ns, way, seconds)
 
-    def _interval(self) -> float:
-        """Give the usual time between frames [s]."""
-        return statistics.median(self._intervals) if self._intervals else USUAL_S
+    def _seconds(self, cadence: Cadence) -> tuple[float, float]:
+        """Give the time between the last two frames of a cadence, and its relative doubt, (44)."""
+        stamped, even = cadence.intervals[-1], cadence.even
+        share = self._habits.evenness
+        seconds = stamped + share * (even - stamped)
+        either = math.sqrt(share * (1 - share)) * (even - stamped) / seconds
+        return seconds, math.hypot(either, share * cadence.doubt)
 
-    def _uneven(self, way: Between, seconds: float) -> Between:
-        """Give a way with the doubt that uneven stamps bring, (44)."""
-        usual = self._interval()
-        off = [abs(s - usual * max(1, round(s / usual))) for s in self._intervals]
-        jitter = 1.5 * statistics.median(off) if off else 0.0
-        along = (jitter / seconds) ** 2 * np.outer(way.motion, way.motion)
-        return replace(way, covariance=way.covariance + along)
+    def _way(self, between: Between, cadence: Cadence) -> tuple[float, Way]:
+        """Give the time between the last two frames of a cadence, and the way that was gone."""
+        seconds, doubt = self._seconds(cadence)
+        return seconds, between.way(seconds, self._habits.readout * cadence.usual, doubt)
 
     def _alone(self, frame: RgbdFrame, params: SolverParams, start: Motion | None) -> DeblurResult:
         """Solve the frame by itself, from a further start where there is one."""
         return self._solve(frame, params, start=start) if start else self._solve(frame, params)
 
     def _restored(
-        self, frame: RgbdFrame, params: SolverParams, alone: DeblurResult, result: DeblurResult
+        self, frame: RgbdFrame, params: SolverParams, alone: DeblurResult, joined: Joined
     ) -> DeblurResult:
         """Restore the image anew where the motion that was settled is not the frame's own."""
+        result, seen = joined.result, joined.seen
         wanted = params.mode != 'motion' and result.outcome is Outcome.SOLVED
-        if self._solve is not deblur or not wanted:
+        if self._solve is not deblur or not wanted or seen is None:
             return result
-        own, settled = alone.motion.vector, result.motion.vector
+        own, settled = alone.motion.vector, seen.vector
         off = min(blur_length(settled + s * own, result.depth, frame.camera) for s in (1, -1))
         if off < OTHER_PX:
             return result
-        known = restore_known(replace(frame, depth=result.depth), result.motion, params)
+        known = restore_known(replace(frame, depth=result.depth), seen, params)
         return replace(result, image=known.image, seconds=result.seconds + known.seconds)
