@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -231,12 +232,10 @@ class McapFile:
             self.blocks[-1] = block._replace(start_ns=start, end_ns=end)
 
     def _count(self, data: bytes) -> None:
-        try:
+        with suppress(*_DAMAGE):
             found = Statistics.read(ReadDataStream(BytesIO(data)))
-        except _DAMAGE:
-            return
-        if found.message_count == sum(found.channel_message_counts.values()):
-            self.stated = found.message_count
+            if found.message_count == sum(found.channel_message_counts.values()):
+                self.stated = found.message_count
 
     def _contents(self, record: Record, reading: _Reading) -> Iterator[tuple[int, bytes]]:
         """Give opcode and content of the records in a block."""
@@ -256,6 +255,8 @@ class McapFile:
             if isinstance(found, Gap):
                 reading.troubles[f'{found.end - found.begin} of its bytes hold no record'] += 1
             elif whole or not found.cut:
+                if found.mended and whole:
+                    reading.troubles['the length of a record was wrong'] += 1
                 inside = content[found.offset : found.end]
                 if found.opcode in (SCHEMA, CHANNEL):
                     self._learn(found.opcode, inside)
@@ -296,9 +297,8 @@ class McapFile:
         try:
             plain = unpack_message(payload) if payload.startswith(_ZSTD_MAGIC) else payload
         except UNPACKING as error:
-            reading.troubles[
-                f'a message on {self._name(channel)} cannot be unpacked: {error}'
-            ] += 1
+            text = f'a message on {self._name(channel)} cannot be unpacked: {error}'
+            reading.troubles[text] += 1
             return None
         reading.given[channel] += 1
         return BagMessage(log_ns, self.topics[channel], plain)

@@ -101,11 +101,11 @@ def _record_at(stream: BinaryIO, at: int, size: int) -> Record | None:
     believed = MESSAGE_HEAD.size <= length <= size - offset
     if opcode == MESSAGE and not believed and is_cdr(stream, offset):
         return Record(MESSAGE, offset, size - offset, cut=True)
+    if opcode in _FIELDS:
+        return _fields_at(stream, Record(opcode, offset, length), size)
     if opcode == 0 or length > size - offset:
         return None
-    if opcode in _FIELDS:
-        sound = _fills(stream, opcode, offset, length)
-    elif opcode in _LEAST:
+    if opcode in _LEAST:
         sound = length >= _LEAST[opcode]
     else:
         sound = _goes_on(stream, offset + length, size)
@@ -128,15 +128,29 @@ def _chunk_at(stream: BinaryIO, offset: int, length: int, size: int) -> Record |
     return None
 
 
+def _fields_at(stream: BinaryIO, record: Record, size: int) -> Record | None:
+    """Give a record of fields; they tell its length too, which counts where another follows."""
+    told = _extent(stream, record.opcode, record.offset, size)
+    if told is None or told == record.length:
+        return record if told else None
+    mended = record._replace(length=told, mended=True)
+    return mended if _begins(stream, mended.end, size) else None
+
+
 def _fills(stream: BinaryIO, opcode: int, offset: int, length: int) -> bool:
     """Whether the fields of a record fill it exactly."""
+    return _extent(stream, opcode, offset, offset + length) == length
+
+
+def _extent(stream: BinaryIO, opcode: int, offset: int, size: int) -> int | None:
+    """Give how long the fields of a record are; None where they do not end before size."""
     before, count, after = _FIELDS[opcode]
-    at, end = offset + before, offset + length
+    at = offset + before
     for _ in range(count):
         at += 4 + int.from_bytes(_read(stream, at, 4), 'little')
-        if at > end:
-            return False
-    return at + after == end
+        if at > size:
+            return None
+    return at + after - offset if at + after <= size else None
 
 
 def _begins(stream: BinaryIO, at: int, size: int) -> bool:

@@ -98,6 +98,7 @@ def test_flipped_bits_cost_no_more_than_with_any_reader(folder, layout, flips):
 @settings(max_examples=100)
 @given(layout=layouts, begin=parts, length=st.integers(1, 400), fill=st.sampled_from([0, 255, 5]))
 @example(layout='no chunks', begin=0.890625, length=1, fill=0)  # a channel in the summary
+@example(layout='no index', begin=0.0625, length=1, fill=255)  # the length of a channel
 def test_an_overwritten_stretch_costs_what_it_covers(folder, layout, begin, length, fill):
     content = bytearray((folder / layout).read_bytes())
     at = int(begin * len(content))
