@@ -8,7 +8,7 @@ from depth_deblur_ros.core.evidence import (
     _spectra,
     EVEN,
     Evidence,
-    gather_evidence,
+    gather_spectra,
     MAX_PATCHES,
     motion_axes,
     scores,
@@ -35,7 +35,11 @@ def table():
 
 
 def evidence_of(grey):
-    return gather_evidence(grey, WHOLE, DEPTH, CAMERA, motion_axes(DEPTH, CAMERA))
+    return spectra_of(grey).evidence()
+
+
+def spectra_of(grey):
+    return gather_spectra(grey, WHOLE, DEPTH, CAMERA, motion_axes(DEPTH, CAMERA))
 
 
 def made_up_evidence(rng):
@@ -150,3 +154,15 @@ def test_the_evidence_does_not_depend_on_how_bright_the_picture_is():
     np.testing.assert_allclose(plain.weight, dim.weight, rtol=1e-4)
     np.testing.assert_allclose(plain.match, dim.match, atol=2e-3)
     assert plain.weight.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize('q', [(12, 0, 0, 0, 0, 0), (-3, 1, 2, 0, 1, 0), (-40, 54, 0, 3, 0, 0)])
+def test_evidence_around_a_motion_is_the_whole_evidence_there(q):
+    spectra = spectra_of(swept(texture(1), 10.0))
+    whole, some = spectra.evidence(), spectra.evidence_around(np.array(q, float), 8)
+    near = np.array(q) + np.random.default_rng(0).uniform(-0.6, 0.6, (200, 6))
+    np.testing.assert_array_equal(scores(near, some), scores(near, whole))
+    wanted = some.match.any(0)
+    np.testing.assert_array_equal(some.match[:, wanted], whole.match[:, wanted])
+    assert wanted.mean() < 0.5
+    assert not scores(np.array([[-q[1], q[0] + 30.0, 0, 0, 0, 0]]), some)[0]

@@ -82,6 +82,19 @@ def test_a_guess_good_or_bad_does_no_harm(factor):
     assert flow_error(result, sideways(12, 0.3)) < 1
 
 
+@pytest.mark.parametrize(('near', 'searched'), [(0.8, False), (-1.1, False), (3.0, True)])
+def test_all_is_searched_only_where_the_guess_does_not_hold(near, searched, monkeypatch):
+    grey, true = swept(texture(1), 12, 0.3), sideways(12, 0.3)
+    calls, search = [], start._search
+    monkeypatch.setattr(start, '_search', lambda *args: calls.append(args) or search(*args))
+    result = blind_start(grey, DEPTH, CAMERA, Motion.from_vector(near * true.vector))
+    assert bool(calls) == searched
+    assert flow_error(result, true) < 1
+    cold = blind_start(grey, DEPTH, CAMERA)
+    assert flow_error(result, cold.motion) < 0.2
+    assert result.quality == pytest.approx(cold.quality, abs=0.01)
+
+
 def test_the_covariance_is_symmetric_positive_and_covers_the_error():
     far = []
     for k, length in enumerate((5, 7, 10, 14, 18)):

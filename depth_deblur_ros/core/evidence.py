@@ -32,6 +32,8 @@ from depth_deblur_ros.core.lanes import (
 from depth_deblur_ros.core.templates import (
     ACROSS,
     BAND_COLUMNS,
+    Blocks,
+    blocks_around,
     HALF,
     matches,
     PATCH,
@@ -62,11 +64,33 @@ class Evidence:
     flow_of_q: FloatImage
 
 
-def gather_evidence(
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """What is seen at one scale: y (B, n), w (B,), J G (B, 2, 6)."""
+
+    logs: FloatImage
+    weight: FloatImage
+    flow_of_q: FloatImage
+
+    def evidence(self) -> Evidence:
+        """Match all patches with all templates."""
+        return self._matched(None)
+
+    def evidence_around(self, q: Vector, room: int) -> Evidence:
+        """Match them with the templates within about `room` px of motion q; the others say 0."""
+        return self._matched(blocks_around(self.flow_of_q @ q, room))
+
+    def _matched(self, some: Blocks | None) -> Evidence:
+        table = template_table()
+        match = matches(self.logs, table.templates, some)
+        return Evidence(match, table.energy, table.sag, self.weight, self.flow_of_q)
+
+
+def gather_spectra(
     grey: FloatImage, valid: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
-) -> Evidence:
+) -> Spectra:
     """
-    Match all patches of one scale with all templates.
+    Look at the patches of one scale.
 
     grey (H, W), valid (H, W) 0..1 (0 = saturated or not trusted), depth (H, W) [m]; axes G (6, 6).
     """
@@ -77,10 +101,8 @@ def gather_evidence(
     logs -= (logs @ table.nuisance) @ table.nuisance.T
     np.clip(logs, *CLIP, out=logs)
     weight = weight**0.25
-    return Evidence(
-        matches(logs, table.templates),
-        table.energy,
-        table.sag,
+    return Spectra(
+        logs,
         weight / max(float(weight.sum()), 1e-12),  # all 0 where all is plain
         _flow_of_q(corners, depth, camera, axes).astype(np.float32),
     )

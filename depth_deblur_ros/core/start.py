@@ -18,9 +18,10 @@ import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Outcome, Vector
 from depth_deblur_ros.core.evidence import (
     Evidence,
-    gather_evidence,
+    gather_spectra,
     motion_axes,
     scores,
+    Spectra,
     thinned,
 )
 from depth_deblur_ros.core.geometry import blur_length
@@ -39,6 +40,9 @@ FEW = 4  # patches; a coarse scale with less has no vote
 MANY = 40  # patches of a scale, of which half are heard on all proposals
 HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that all patches judge; that seeds are of
 SEEDS = 8  # distinct motions that each scale refines
+NEAR = 3.0  # px; how wide it is searched around a guess
+ASTRAY = 6.0  # px from the guess, beyond which all is searched
+ROOM = 10  # px of templates around the guess, more than the search around it goes
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
 SATURATED = 0.98
@@ -90,14 +94,22 @@ def blind_start(
     edges = sharpness(grey)
     if edges > CLEARLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
-    scales = _scales(grey, depth, camera, axes)
-    if not scales:
+    spectra = _spectra(grey, depth, camera, axes)
+    if not spectra:
         return _nothing(Outcome.FAILED, axes)
-    guesses = [np.asarray(np.linalg.solve(axes, guess.vector))] if guess else []
-    q = _search(scales, guesses)
-    length = blur_length(axes @ q, depth, camera)
-    if not _trusted(q, length, scales, edges):
-        return _nothing(Outcome.SHARP if edges > RATHER_SHARP else Outcome.FAILED, axes)
+
+    def length(q: Vector) -> float:
+        return blur_length(axes @ q, depth, camera)
+
+    first = np.asarray(np.linalg.solve(axes, guess.vector)) if guess else None
+    if first is not None:
+        scales = _scales(spectra, first)
+        q = _refine(_refine(first[None], scales, NEAR), scales, 1.0)[0]
+    if first is None or length(q - first) > ASTRAY or not _trusted(q, length(q), scales, edges):
+        scales = _scales(spectra)
+        q = _search(scales, first)
+        if not _trusted(q, length(q), scales, edges):
+            return _nothing(Outcome.SHARP if edges > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     return Start(
         Motion.from_vector(axes @ q, _covariance(q, scales, axes)), Outcome.SOLVED, quality
@@ -136,12 +148,12 @@ def _covariance(q: Vector, scales: list[Scale], axes: Vector) -> Vector:
 _SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
-def _scales(
+def _spectra(
     grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
-) -> list[Scale]:
-    """Gather the evidence of each scale that holds enough patches, of the full one always."""
+) -> dict[int, Spectra]:
+    """Look at each scale that holds enough patches, at the full one always, by its factor."""
     whole = _whole(grey)
-    found: list[Scale] = []
+    found: dict[int, Spectra] = {}
     for factor in SCALES:
         width, height = camera.width // factor, camera.height // factor
         if min(width, height) < PATCH:
@@ -155,11 +167,22 @@ def _scales(
             )
         ]
         small, whole_small, near = images
-        evidence = gather_evidence(small, whole_small, near, camera.scaled(width, height), axes)
-        if found and len(evidence.weight) < FEW:
+        scaled = camera.scaled(width, height)
+        spectra = gather_spectra(small, whole_small, near, scaled, axes)
+        if found and len(spectra.weight) < FEW:
             break
-        found.append(Scale(factor, evidence))
+        found[factor] = spectra
     return found
+
+
+def _scales(spectra: dict[int, Spectra], near: Vector | None = None) -> list[Scale]:
+    """Gather the evidence of each scale, of all motions or of those near one."""
+    if near is None:
+        return [Scale(factor, own.evidence()) for factor, own in spectra.items()]
+    return [
+        Scale(factor, own.evidence_around(near, ROOM // factor + 2))
+        for factor, own in spectra.items()
+    ]
 
 
 def _whole(grey: FloatImage) -> FloatImage:
@@ -176,9 +199,9 @@ def common_score(qs: Vector, scales: list[Scale]) -> Vector:
     return np.asarray(total)
 
 
-def _search(scales: list[Scale], guesses: list[Vector]) -> Vector:
+def _search(scales: list[Scale], guess: Vector | None) -> Vector:
     """Let each scale propose and all choose; q (6,)."""
-    found = list(guesses)
+    found = [] if guess is None else [guess]
     for scale in scales:
         found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor))
     return np.asarray(_refine(_choose(np.array(found), scales)[None], scales, 1.0)[0])

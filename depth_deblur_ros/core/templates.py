@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-from depth_deblur_ros.core.data import FloatImage
+from depth_deblur_ros.core.data import FloatImage, Vector
 from depth_deblur_ros.core.lanes import load, splat, store, WIDTH
 from numba import njit, prange
 import numpy as np
@@ -32,6 +32,8 @@ BAND_COLUMNS = int(BAND[1] * PATCH)  # of them from zero on, in the band
 FLOOR = 0.035  # how deep the dark bands are filled by noise and by neighbours in the window
 BLOCK = 2 * WIDTH  # flows that are matched together
 ACROSS = -(-(2 * REACH + 1) // BLOCK) * BLOCK  # columns of the table: u = -REACH.., then unused
+
+Blocks = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +94,34 @@ def _mean_square(t: FloatImage) -> FloatImage:
     return np.asarray(np.einsum('nvu,nvu->vu', t, t) / np.float32(len(t)))
 
 
-def matches(logs: FloatImage, templates: FloatImage) -> FloatImage:
-    """Give C = <y, T> / n, (B, rows, ACROSS), of log-spectra y (B, n) and templates."""
+def matches(logs: FloatImage, templates: FloatImage, some: Blocks | None = None) -> FloatImage:
+    """
+    Give C = <y, T> / n, (B, rows, ACROSS), of log-spectra y (B, n) and templates.
+
+    some (rows, blocks): the blocks that are wanted; the others are zero.
+    """
     patches, count = len(logs), logs.shape[1]
-    some = -(-patches // 4) * 4
-    padded = np.zeros((some, count), np.float32)
-    np.divide(logs, np.float32(count), out=padded[:patches])
     rows, blocks = templates.shape[:2]
-    match = np.empty((some, rows, blocks * BLOCK), np.float32)
-    _match(padded, templates.reshape(rows * blocks, -1), match.reshape(some, -1))
-    return match[:patches]
+    wanted = np.arange(rows * blocks) if some is None else np.flatnonzero(some)
+    padded = np.zeros((-(-patches // 4) * 4, count), np.float32)
+    np.divide(logs, np.float32(count), out=padded[:patches])
+    match = np.zeros((len(padded), rows * blocks * BLOCK), np.float32)
+    _match(padded, templates.reshape(rows * blocks, -1), wanted, match)
+    return match[:patches].reshape(patches, rows, -1)
+
+
+def blocks_around(flow: Vector, room: int) -> Blocks:
+    """Say which blocks (rows, blocks) hold flows within `room` px of those of flow (B, 2)."""
+    wanted = np.zeros((REACH + 1, ACROSS // BLOCK), np.bool_)
+    u = flow[:, :1] + np.append(np.arange(-room, room, BLOCK), room)
+    v = np.rint(flow[:, 1:] + np.arange(-room, room + 1))
+    u, v = np.broadcast_arrays(u[:, None], v[..., None])
+    for sign in (1, -1):  # u, v and -u, -v are one; the row v = 0 serves both
+        inside = (np.abs(u) <= REACH) & (sign * v >= 0) & (np.abs(v) <= REACH)
+        wanted[np.abs(v[inside]).astype(int), (sign * u[inside] + REACH).astype(int) // BLOCK] = (
+            True
+        )
+    return wanted
 
 
 @njit(cache=True, nogil=True)
@@ -133,9 +153,10 @@ def _match_block(first, logs, templates, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _match(logs, templates, match):  # type: ignore[no-untyped-def]
+def _match(logs, templates, wanted, match):  # type: ignore[no-untyped-def]
     """Write logs (4 m, n) times templates (blocks, n * BLOCK) into match (4 m, blocks * BLOCK)."""
-    for k in prange(templates.shape[0]):
+    for i in prange(wanted.size):
+        k = wanted[i]
         out = np.empty(4 * BLOCK, np.float32)
         for first in range(0, logs.shape[0], 4):
             _match_block(first, logs, templates[k], out)
