@@ -6,12 +6,15 @@ from pathlib import Path
 import random
 import resource
 import signal
+import subprocess
 import sys
 import time
 
-from depth_deblur_ros.bag import BagReader, BagWriter
+from depth_deblur_ros.bag import BagReader, BagWriter, decoded
 from depth_deblur_ros.core.data import InputError
+from depth_deblur_ros.journal import pairs_done
 from depth_deblur_ros.messages import header_fields, image_fields
+from depth_deblur_ros.review import TWIST_TOPIC
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
@@ -20,6 +23,7 @@ import stub_replay
 import test_replay
 from test_replay import run, START, STEP, write_depth, write_info
 
+SAMPLE = Path(__file__).resolve().parents[1] / 'bags/sample'
 FRAMES = 12
 SHAPE = (48, 64)
 MOMENTS = [
@@ -258,3 +262,48 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing_corrupt(bag, tmp_path
         assert found.damage == []
         assert len(list(found.messages({'/result'}))) == FRAMES
     assert sorted(p.name for p in tmp_path.iterdir()) == ['e.jsonl', 'out']
+
+
+def with_gyro(source, path):
+    """Copy a bag and add a gyro that tells its true turns, 200 times a second."""
+    with BagReader(source) as found, BagWriter(path) as bag:
+        messages = list(found.messages(found.topics))
+        truth = [(m.log_ns, decoded(m)) for m in messages if m.topic.name == TWIST_TOPIC]
+        times = np.array([log for log, _ in truth], np.float64)
+        turns = np.array([[getattr(t.twist.angular, a) for a in 'xyz'] for _, t in truth])
+        for log in range(int(times[0]), int(times[-1]), 5_000_000):
+            rate = [float(np.interp(log, times, turn)) for turn in turns.T]
+            fields = {
+                'header': header_fields(log, 'camera'),
+                'angular_velocity': dict(zip('xyz', rate, strict=True)),
+            }
+            bag.write('/imu', 'sensor_msgs/msg/Imu', fields, log)
+        for message in messages:
+            bag.copy(message)
+    return path
+
+
+@pytest.mark.slow
+def test_the_real_solver_goes_on_with_its_gyro_behind_a_kill(tmp_path):
+    bag = with_gyro(SAMPLE, tmp_path / 'in')
+    flags = ['--mode', 'motion', '--all-topics', '--estimates']
+
+    def line(source, out, *more):
+        begin = [sys.executable, '-m', 'depth_deblur_ros', 'replay', source, out]
+        return [*map(str, begin), *flags, f'{out}.jsonl', *more]
+
+    plain, whole, cut = (tmp_path / name / 'out' for name in ('plain', 'whole', 'cut'))
+    assert subprocess.run(line(SAMPLE, plain)).returncode == 0
+    assert subprocess.run(line(bag, whole)).returncode == 0
+    assert files(whole)[1] != files(plain)[1]  # the gyro counts
+    resumed = line(bag, cut, '--resume')
+    for pairs in (2, 6):
+        process = subprocess.Popen(resumed)
+        while pairs_done(cut) < pairs:
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    assert not cut.exists()
+    assert subprocess.run(resumed).returncode == 0
+    assert files(cut) == files(whole)
