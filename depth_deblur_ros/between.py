@@ -21,16 +21,16 @@ import numpy.typing as npt
 
 WIDTH = 400  # px; wider images are halved until they are no wider
 CORNERS, QUALITY, APART = 400, 0.005, 6  # of goodFeaturesToTrack; the last in px
-WINDOW, LEVELS = (21, 21), 4
+WINDOW, LEVELS = (15, 15), 4
 THERE_AND_BACK = 0.7  # px; a track that does not come back is none
 SAME_SURFACE = 0.15  # relative depth between both ends of a track
 ROUNDS = 12
 FINEST = 0.2  # px; no track is better than this
 EVERY = 10  # px; of the pixels that stand for all
 ROLL_RIDGE = 40.0  # px^2/rad^2; keeps what nothing tells of a rolling shutter near zero
-CUT = 4.0  # standard deviations; what is farther off does not count
+CUT = 3.0  # standard deviations; what is farther off does not count
 FEWEST, LEAST_SHARE = 20, 0.4  # of the tracks must agree
-OPTIMISM = 9.0  # times variance: errors of tracks are alike, the more so the larger they are
+OPTIMISM = 2.0  # times variance: errors of tracks are alike, the more so the larger they are
 
 
 @dataclass(frozen=True, eq=False)

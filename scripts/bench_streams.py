@@ -1,7 +1,7 @@
 """
 Measure what tracking tells on the bags of make_streams.py, through replay.
 
-usage: python scripts/bench_streams.py FOLDER [--imu none|good|reversed|late|offset]
+usage: python scripts/bench_streams.py FOLDER [--imu none|good|reversed|late|offset] [--mode MODE]
 
 One line per bag: median error of the exposure; rms error of the angular and the linear velocity
 over that of no motion, frames that tell none counting as such; sign and told in percent.
@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from depth_deblur_ros.bag import BagReader, decoded
-from depth_deblur_ros.core.params import SolverParams
+from depth_deblur_ros.core.params import MODES, SolverParams
 from depth_deblur_ros.gyro import Gyro
 from depth_deblur_ros.replay import replay
 import numpy as np
@@ -101,11 +101,11 @@ def score(records: list[dict[str, Any]], twists: Array, exposures: Array) -> Sco
     )
 
 
-def measured(bag: Path) -> Score:
+def measured(bag: Path, mode: str) -> Score:
     """Replay a bag and score it."""
     with tempfile.TemporaryDirectory() as folder:
         lines = Path(folder) / 'motion.jsonl'
-        replay(bag, Path(folder) / 'out', params=SolverParams(mode='motion'), estimates=lines)
+        replay(bag, Path(folder) / 'out', params=SolverParams(mode=mode), estimates=lines)
         records = [json.loads(line) for line in lines.read_text().splitlines()]
     return score(records, *truth_of(bag))
 
@@ -116,11 +116,12 @@ def main() -> None:
     parser.add_argument('folder', type=Path)
     kinds = ('none', 'good', 'reversed', 'late', 'offset')
     parser.add_argument('--imu', choices=kinds, default='none')
+    parser.add_argument('--mode', choices=MODES, default='full')
     args = parser.parse_args()
     spoil(args.imu)
     print('| stream | exposure | angular | linear | sign % | told % |\n|---|---|---|---|---|---|')
     for bag in sorted(path for path in args.folder.iterdir() if not path.name.startswith('.')):
-        print(f'| {bag.name} {measured(bag)}', flush=True)
+        print(f'| {bag.name} {measured(bag, args.mode)}', flush=True)
 
 
 if __name__ == '__main__':
