@@ -81,7 +81,7 @@ setup(
         'console_scripts': [
             f'depth-deblur = {NAME}.cli:main',
             f'replay = {NAME}.cli:replay_main',
-            f'deblur_node = {NAME}.node:main',
+            f'deblur_node = {NAME}.deblur_node:main',
         ],
     },
 )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
-import ctypes
 from dataclasses import replace
 import threading
 from typing import Any, Generic, TypeVar
@@ -33,10 +32,7 @@ MAX_BYTES = 4 * MAX_PIXELS  # of one message; larger ones are not taken
 TOO_LARGE = f'a message of more than {MAX_BYTES} bytes'
 KEPT_INFOS = 30
 KEPT_EXPOSURES = 300
-# glibc's M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_TOP_PAD, bytes: an image's memory stays with the
-# process, so that the next one does not pay for its pages again.
 _SOLVING = threading.Lock()  # numba's plainest thread pool breaks when two threads call it
-_MALLOPT = ((-1, 1 << 28), (-3, 1 << 25), (-2, 1 << 24))
 
 
 class Mailbox(Generic[T]):
@@ -259,11 +255,3 @@ def compile_kernels() -> None:
     turn = Motion(np.array([0.0, 0.05, 0.0]), np.zeros(3))
     for mode in ('fast', 'full'):
         restore_known(frame, turn, SolverParams(mode=mode))
-
-
-def keep_freed_memory() -> None:
-    """Tell glibc to keep the memory of images for the next ones; elsewhere nothing happens."""
-    library = ctypes.CDLL(None)
-    if hasattr(library, 'mallopt'):
-        for option, size in _MALLOPT:
-            library.mallopt(option, size)

@@ -20,7 +20,8 @@ from depth_deblur_ros.core.data import InputError
 from depth_deblur_ros.core.solver import deblur
 from depth_deblur_ros.frames import SolvedPair
 from depth_deblur_ros.health import OK, Said, Stream
-from depth_deblur_ros.live import compile_kernels, end_work, keep_freed_memory
+from depth_deblur_ros.live import compile_kernels, end_work
+from depth_deblur_ros.memory import keep_freed_memory
 from depth_deblur_ros.messages import compressed_fields, Fields, filled, stamp_ns
 from depth_deblur_ros.pipeline import Pipeline
 from depth_deblur_ros.results import DEPTH, IMAGE, TYPES

@@ -38,7 +38,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Image
 
-NODE = 'import sys; from depth_deblur_ros.node import main; sys.exit(main())'
+NODE = 'import sys; from depth_deblur_ros.deblur_node import main; sys.exit(main())'
 RATE = 30.0
 EVENT_S = (2.0, 8.0)  # between two events
 PATIENCE_S = 120.0  # for a service: the machine may be busy

@@ -31,7 +31,7 @@ STUB = (sys.executable, str(ROOT / 'test/stub_node.py'))
 NODE = (
     sys.executable,
     '-c',
-    'import sys; from depth_deblur_ros.node import main; sys.exit(main())',
+    'import sys; from depth_deblur_ros.deblur_node import main; sys.exit(main())',
 )
 CAMERA = CameraIntrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
 COLOUR, DEPTH, INFO = 'rgb/image_rect_color', 'depth_registered/image_rect', 'rgb/camera_info'

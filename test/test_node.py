@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 import signal
+import subprocess
 import sys
 import time
 
@@ -505,6 +506,25 @@ def test_signals_do_not_wait_for_a_slow_solver(peer, start, signals):
     assert node.wait(30) == 0
     assert time.monotonic() - begin < 10  # by itself it takes one
     assert 'rror' not in node.text() and not moves
+
+
+@pytest.mark.parametrize('name', ['INT', 'TERM'])
+@pytest.mark.parametrize('module', ['numba', 'rclpy', 'sensor_msgs.msg'])
+def test_a_signal_while_it_is_being_loaded_ends_it_in_peace(name, module):
+    code = f"""
+import os, signal, sys
+
+class Loading:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIG{name})
+
+sys.meta_path.insert(0, Loading())
+from depth_deblur_ros.deblur_node import main
+sys.exit(main())
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
 def test_a_large_frame_in_full_does_not_delay_the_end(peer, start, tmp_path):
