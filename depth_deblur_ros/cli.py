@@ -32,6 +32,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code."""
     try:
         args = _parser().parse_args(argv)
+        if 'mode' in args:  # a command that solves
+            from depth_deblur_ros.compiling import tell_of_compiling
+
+            tell_of_compiling(lambda text: print(f'depth-deblur: {text}', file=sys.stderr))
         code: int = args.run(args)
         return code
     except (InputError, OSError) as error:

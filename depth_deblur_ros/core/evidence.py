@@ -43,7 +43,6 @@ from depth_deblur_ros.core.templates import (
 from numba import njit, prange
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 STEP = 48  # px between patches
 CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sensor
@@ -129,10 +128,10 @@ def _spectra(
         for x in np.unique(xs):
             strip = window * field[:, x : x + PATCH]
             square = np.square(strip).sum(1)
-            rows = fft.rfft(strip, axis=1)[:, :BAND_COLUMNS]
+            rows = np.fft.rfft(strip, axis=1)[:, :BAND_COLUMNS]
             own = np.flatnonzero(xs == x)
             cut = np.array([rows[y : y + PATCH] for y in ys[own]]) * window[:, None]
-            found = fft.fft(cut, axis=1, overwrite_x=True).reshape(len(own), -1)[:, places]
+            found = np.fft.fft(cut, axis=1).reshape(len(own), -1)[:, places]
             power[own] += found.real**2 + found.imag**2
             weight[own] += [window**2 @ square[y : y + PATCH] for y in ys[own]]
     return power, weight / np.float32(PATCH**2)

@@ -262,13 +262,17 @@ def _sum_rows(strips, rows, x, links, ease, out, products):  # type: ignore[no-u
     """Write the sum of strips of A' (of `rows` rows of B) and the prior's part of x into out."""
     high = out.shape[1]
     count, _, depth, _ = strips.shape
+    wide = out.shape[2]
     flat = (x.reshape(-1), links.reshape(-1), ease.reshape(-1))
     for y in prange(GUARD, high - GUARD):
-        out[:, y] = 0
-        for k in range(count):
-            j = y - np.int64(k) * rows // count
-            if 0 <= j < depth:
-                out[:, y] += strips[k, :, j]
+        for c in range(3):
+            for i in range(wide):
+                out[c, y, i] = 0
+            for k in range(count):
+                j = y - np.int64(k) * rows // count
+                if 0 <= j < depth:
+                    for i in range(wide):
+                        out[c, y, i] += strips[k, c, j, i]
         _add_prior(y, *flat, out, products, np.empty(WIDTH, np.float32))
 
 

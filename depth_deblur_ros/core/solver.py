@@ -18,7 +18,6 @@ from dataclasses import replace
 import time
 
 import cv2
-from depth_deblur_ros.core.alternation import alternate, restore
 from depth_deblur_ros.core.data import (
     DeblurResult,
     EnergyStep,
@@ -99,6 +98,8 @@ def _restored(
     """Run the image step on a colour or grey frame."""
     colour, camera = _colour(frame.image), frame.camera
     if params.method == 'paper':
+        from depth_deblur_ros.core.alternation import restore
+
         light = light_from_stored(colour, camera.transfer)
         latent = restore(light, depth, camera, motion.vector, params)
         sharp = stored_from_light(latent, camera.transfer)
@@ -115,6 +116,8 @@ def _alternated(
     frame: RgbdFrame, depth: FloatImage, params: SolverParams
 ) -> tuple[Start, tuple[EnergyStep, ...]]:
     """Find the motion by the paper's method, with the energies on the way."""
+    from depth_deblur_ros.core.alternation import alternate  # brings scipy: half a second
+
     light = light_from_stored(_colour(frame.image), frame.camera.transfer)
     found = alternate(light, depth, frame.camera, params)
     return Start(Motion.from_vector(found.p), found.outcome, found.quality), found.trace

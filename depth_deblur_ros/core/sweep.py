@@ -123,6 +123,16 @@ def _displacement(a, b, w, back, far):  # type: ignore[no-untyped-def]
     return larger(smaller(back * (a + w * b), splat(far)), splat(-far))
 
 
+@njit(cache=True, nogil=True)
+def _span(lanes):  # type: ignore[no-untyped-def]
+    """Give the first offset that a block's displacements need, and how many."""
+    low = high = lanes[0]
+    for j in range(1, WIDTH):
+        low, high = min(low, lanes[j]), max(high, lanes[j])
+    first = math.floor(low)
+    return first, math.floor(high) - first + 2
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _find_cells(nearness, flow, far, cells):  # type: ignore[no-untyped-def]
     """Write where each block begins to read at each instant, and how many columns and rows."""
@@ -138,10 +148,8 @@ def _find_cells(nearness, flow, far, cells):  # type: ignore[no-untyped-def]
                 store(dx, 0, _displacement(a, b, w, back, far))
                 a, b = load(parts, at + width), load(parts, at + 3 * width)
                 store(dy, 0, _displacement(a, b, w, back, far))
-                left, top = math.floor(dx.min()), math.floor(dy.min())
-                cells[y, k, i, 0], cells[y, k, i, 1] = left, top
-                cells[y, k, i, 2] = math.floor(dx.max()) - left + 2
-                cells[y, k, i, 3] = math.floor(dy.max()) - top + 2
+                cells[y, k, i, 0], cells[y, k, i, 2] = _span(dx)
+                cells[y, k, i, 1], cells[y, k, i, 3] = _span(dy)
 
 
 @njit(cache=True, nogil=True, inline='always')
