@@ -15,6 +15,8 @@ from depth_deblur_ros.core.data import InputError
 from depth_deblur_ros.core.params import knobs, params_from_mapping, SolverParams
 import yaml
 
+TRUTHS = {'true': True, 'false': False}
+
 
 class Parser(argparse.ArgumentParser):
     """Say what is wrong in one line, as for every other bad input."""
@@ -41,6 +43,13 @@ def topic(text: str) -> tuple[str, str]:
     return name, topic
 
 
+def truth(text: str) -> bool:
+    """Read true or false."""
+    if text.lower() not in TRUTHS:
+        raise argparse.ArgumentTypeError(f'{text!r} is neither true nor false')
+    return TRUTHS[text.lower()]
+
+
 def solver_flags(parser: Parser) -> None:
     """Add --params and one flag for each solver parameter; a flag counts more than the file."""
     group = parser.add_argument_group('solver parameters')
@@ -50,15 +59,21 @@ def solver_flags(parser: Parser) -> None:
         limits = 'TEXT'
         if 'choices' in meta:
             limits = '|'.join(meta['choices'])
+        elif isinstance(knob.default, bool):
+            limits = '|'.join(TRUTHS)
         elif 'low' in meta:
             limits = f'{meta["low"]}..{meta["high"]}'
         group.add_argument(
             '--' + knob.name.replace('_', '-'),
-            type=type(knob.default),
+            type=truth if isinstance(knob.default, bool) else type(knob.default),
             default=argparse.SUPPRESS,
             metavar=limits,
-            help=f'{meta["help"]} (default: {knob.default})'.replace('%', '%%'),
+            help=f'{meta["help"]} (default: {_shown(knob.default)})'.replace('%', '%%'),
         )
+
+
+def _shown(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def solver_params(args: argparse.Namespace) -> SolverParams:

@@ -23,6 +23,7 @@ from depth_deblur_ros.core.data import (
     InputError,
     RgbdFrame,
 )
+from depth_deblur_ros.core.lens import undistorted
 import numpy as np
 import numpy.typing as npt
 
@@ -121,14 +122,15 @@ def read_depth(path: Path, depth_scale: float, camera: CameraIntrinsics) -> Floa
 
 
 def read_frame(rgb: Path, depth: Path, camera: Path) -> RgbdFrame:
-    """Read a frame; what the camera file says of distortion stays with the frame's camera."""
+    """Read a frame; the distortion that the camera file tells is undone."""
     file = read_camera(camera)
-    return RgbdFrame(
+    frame = RgbdFrame(
         image=read_rgb(rgb, file.intrinsics),
         depth=read_depth(depth, file.depth_scale, file.intrinsics),
         camera=file.intrinsics,
         exposure=file.exposure,
     )
+    return undistorted(frame)
 
 
 def write_image(path: Path, image: npt.NDArray[Any]) -> None:

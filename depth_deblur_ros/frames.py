@@ -7,11 +7,9 @@ Images with distortion are undistorted first; the frame's camera is then one wit
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 import traceback
 from typing import Any
 
-import cv2
 from depth_deblur_ros.core.data import (
     CameraIntrinsics,
     DeblurResult,
@@ -19,6 +17,7 @@ from depth_deblur_ros.core.data import (
     InputError,
     RgbdFrame,
 )
+from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.messages import (
     camera_from_msg,
@@ -30,7 +29,6 @@ from depth_deblur_ros.messages import (
 )
 from depth_deblur_ros.results import refused_result, result_messages
 from depth_deblur_ros.tracking import Tracker
-import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,32 +138,7 @@ def frame_from_pair(pair: Pair, given: Given | None = None) -> RgbdFrame:
         exposure=given.exposure_s if pair.exposure is None else pair.exposure,
         stamp_ns=stamp_ns(pair.colour.header),
     )
-    return undistorted(frame) if frame.camera.distortion else frame
-
-
-def undistorted(frame: RgbdFrame) -> RgbdFrame:
-    """Give the frame as a camera without distortion sees it; depth that is not seen is a hole."""
-    map_x, map_y = _undistortion(frame.camera)
-    border = cv2.BORDER_REPLICATE
-    image = cv2.remap(frame.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
-    # Depths are never mixed: between a near and a far thing there is nothing.
-    depth = cv2.remap(frame.depth, map_x, map_y, cv2.INTER_NEAREST, borderValue=np.nan)
-    return replace(
-        frame,
-        image=np.asarray(image, np.float32).clip(0, 1),
-        depth=np.asarray(depth, np.float32),
-        camera=replace(frame.camera, distortion=None),
-    )
-
-
-@lru_cache(maxsize=2)
-def _undistortion(camera: CameraIntrinsics) -> tuple[FloatImage, FloatImage]:
-    """Give, for each pixel without distortion, where it is in the image as it was taken."""
-    k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    size = (camera.width, camera.height)
-    coefficients = np.array(camera.distortion)
-    maps = cv2.initUndistortRectifyMap(k, coefficients, None, k, size, cv2.CV_32FC1)
-    return np.asarray(maps[0]), np.asarray(maps[1])
+    return undistorted(frame)
 
 
 def _image(msg: Any) -> FloatImage | None:

@@ -100,7 +100,7 @@ def replay(
         raise InputError(f'{out} is the bag to read: the results need another name')
     target = BagWriter(out, overwrite=overwrite)
     _check_place(estimates)
-    given = Given(camera, exposure_s)
+    given = Given(camera, exposure_s, params.rectified)
     with BagReader(bag) as reader:
         names = choose_topics(reader, topics or {}, with_info=camera is None)
         span = _span(reader, start, duration)

@@ -49,7 +49,6 @@ class NodeParams:
     camera: str = free(
         '', f'instead of camera_info: path of a camera.json, or {", ".join(PRESETS)}'
     )
-    rectified: bool = free(True, 'P of camera_info counts; false: K and D, undistorts first')
     transfer: str = choice('srgb', TRANSFERS, 'in which space light was averaged; srgb: cameras')
     jpeg_quality: int = knob(95, 1, 100, 'of deblurred/image/compressed')
 
@@ -109,7 +108,7 @@ def settings_from(values: Mapping[str, Any], before: Settings | None = None) -> 
         return before
     node = replace(before.node, **{name: values[name] for name in values.keys() & own})
     solver = replace(before.solver, **{name: values[name] for name in values.keys() & solvers})
-    return Settings(solver, node, _given(node))
+    return Settings(solver, node, _given(node, solver))
 
 
 def without_node_values(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,12 +127,12 @@ def _image_source(topic: str, transport: str) -> Source:
     return Source(topic, 'sensor_msgs/msg/CompressedImage', suffix=f'/{transport}')
 
 
-def _given(node: NodeParams) -> Given:
+def _given(node: NodeParams, solver: SolverParams) -> Given:
     file = _camera(node.camera) if node.camera else None
     return Given(
         camera=replace(file.intrinsics, transfer=node.transfer) if file else None,
         exposure_s=node.exposure_s or (file.exposure if file else None),
-        rectified=node.rectified,
+        rectified=solver.rectified,
         transfer=node.transfer,
     )
 

@@ -32,6 +32,8 @@ from depth_deblur_ros.shutter import Exposure, Shutter
 import numpy as np
 
 GAP_S = 0.25  # frames farther apart are not neighbours
+SHORTEST_NS = 1_000_000  # between frames
+AFTER = {'start': 0.5, 'middle': 0.0, 'end': -0.5}  # exposures from a stamp to mid-exposure
 OTHER_PX = 1.0  # px; motions less apart than this give the same image
 
 
@@ -65,10 +67,11 @@ class Tracked:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A frame as it is tracked, when it was, and the way to it from the one before."""
+    """A frame as it is tracked, its stamp and middle, and the way to it from the one before."""
 
     view: View
     stamp_ns: int
+    middle_ns: int
     between: Between | None
     seconds: float | None  # since the one before; None where they are not neighbours
 
@@ -131,7 +134,7 @@ class Tracker:
         """Go on to a frame, look at the following one, ask the gyro."""
         seen = self._arrive(frame, params)
         glide, known = self._glide, seen.between is not None
-        self._ahead = self._seen(following, seen) if following else None
+        self._ahead = self._seen(following, seen, params) if following else None
         if self._ahead and self._ahead.between and self._ahead.seconds:
             cadence = self._cadence.later(self._ahead.seconds)
             glide = glide.before(*self._way(self._ahead.between, cadence))
@@ -144,7 +147,7 @@ class Tracker:
     def _turned(self, stamp_ns: int, context: Context, params: SolverParams) -> Context:
         """Let the gyro tell the turn over the exposure."""
         seconds = context.exposure.seconds if context.exposure else GUESS * context.interval
-        turn = self.gyro.measured(stamp_ns, seconds, params)
+        turn = self.gyro.measured(_middle_ns(stamp_ns, seconds, params), seconds, params)
         if turn is None:
             return context
         self._glide = self._glide.measured(*turn)
@@ -154,7 +157,7 @@ class Tracker:
         """Take a frame in: the velocity is then that at its stamp."""
         seen = self._ahead
         if seen is None or seen.stamp_ns != frame.stamp_ns:
-            seen = self._seen(frame, self._last)
+            seen = self._seen(frame, self._last, params)
         self._last, self._ahead = seen, None
         if seen.seconds is None:
             self._glide, self._habits = unknown_glide(), self._habits.parted()
@@ -167,17 +170,18 @@ class Tracker:
         if seen.between:
             seconds, way = self._way(seen.between, self._cadence)
         self._glide = self._glide.moved(seconds, way)
-        first_ns = frame.stamp_ns - round(1e9 * seconds)
+        first_ns = seen.middle_ns - round(1e9 * seconds)
         self.gyro.compare(first_ns, seen.between, seconds, params)
         return seen
 
-    def _seen(self, frame: RgbdFrame, before: Seen | None) -> Seen:
+    def _seen(self, frame: RgbdFrame, before: Seen | None, params: SolverParams) -> Seen:
         """Look at a frame, and track from the one before if they are neighbours."""
         view, way, seconds = view_of(frame), None, None
+        middle_ns = _middle_ns(frame.stamp_ns, frame.exposure or 0.0, params)
         if before and 0 < frame.stamp_ns - before.stamp_ns <= GAP_S * 1e9:
-            seconds = (frame.stamp_ns - before.stamp_ns) / 1e9
             way = motion_between(before.view, view)
-        return Seen(view, frame.stamp_ns, way, seconds)
+            seconds = max(middle_ns - before.middle_ns, SHORTEST_NS) / 1e9
+        return Seen(view, frame.stamp_ns, middle_ns, way, seconds)
 
     def _seconds(self, cadence: Cadence) -> tuple[float, float]:
         """Give the time between the last two frames of a cadence, and its relative doubt, (44)."""
@@ -210,3 +214,8 @@ class Tracker:
             return result
         known = restore_known(replace(frame, depth=result.depth), seen, params)
         return replace(result, image=known.image, seconds=result.seconds + known.seconds)
+
+
+def _middle_ns(stamp_ns: int, exposure: float, params: SolverParams) -> int:
+    """Give the middle of an exposure [s]."""
+    return stamp_ns + round(1e9 * AFTER[params.stamp_at] * exposure)

@@ -94,6 +94,20 @@ def test_a_flag_counts_more_than_the_file(tmp_path):
     )
 
 
+def test_what_the_node_is_told_of_its_images_counts_for_bags_too(tmp_path):
+    (tmp_path / 'p.yaml').write_text(
+        '/**:\n  ros__parameters:\n    rectified: false\n    stamp_at: end\n'
+    )
+    argv = ['replay', 'a', 'b', '--params', str(tmp_path / 'p.yaml')]
+    assert not flags.solver_params(cli._parser().parse_args(argv)).rectified
+    told = flags.solver_params(cli._parser().parse_args([*argv, '--rectified', 'true']))
+    assert (told.rectified, told.stamp_at) == (True, 'end')
+
+
+def test_a_switch_is_true_or_false(capsys):
+    assert 'neither true nor false' in refusal(['replay', 'a', 'b', '--rectified', 'no'], capsys)
+
+
 def test_the_shipped_config_is_a_parameter_file():
     path = Path(__file__).parents[1] / 'config/deblur.yaml'
     args = cli._parser().parse_args(['bench', 'cases', '-o', 'out', '--params', str(path)])

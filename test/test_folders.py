@@ -251,3 +251,14 @@ def test_json_never_holds_nan(tmp_path):
     with pytest.raises(ValueError, match='not JSON compliant'):
         write_json(tmp_path / 'motion.json', {'quality': math.nan})
     assert not list(tmp_path.iterdir())
+
+
+def test_a_frame_of_a_distorting_lens_is_undistorted(camera_json, tmp_path):
+    rgb, depth = tmp_path / 'rgb.png', tmp_path / 'depth.png'
+    pixels = image()
+    cv2.imwrite(str(rgb), pixels)
+    cv2.imwrite(str(depth), np.full((32, 48), 5000, np.uint16))
+    frame = read_frame(rgb, depth, camera_json(distortion=[0.3, 0, 0, 0]))
+    assert frame.camera.distortion is None
+    assert np.isnan(frame.depth[0, 0]) and frame.depth[16, 24] == 1
+    assert np.abs(255 * frame.image[..., ::-1] - pixels).max() > 20

@@ -5,16 +5,21 @@ from types import SimpleNamespace
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, InputError, Outcome, RgbdFrame
+from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.params import SolverParams
-from depth_deblur_ros.frames import frame_from_pair, Given, Pair, solve_anyhow, undistorted
+from depth_deblur_ros.core.solver import deblur
+from depth_deblur_ros.frames import frame_from_pair, Given, Pair, solve_anyhow
 from depth_deblur_ros.messages import camera_info_fields, depth_fields, header_fields, image_fields
 from depth_deblur_ros.results import CAMERA_INFO, IMAGE, RESULT
 from depth_deblur_ros.tracking import Tracker
 import numpy as np
+from pictures import swept, texture
 import pytest
 
 LENS = (0.26, -0.95, -0.005, 0.003, 1.16)
 CAMERA = CameraIntrinsics(260.0, 258.0, 159.0, 127.0, 320, 240)
+HEADER = header_fields(7, 'c')
 
 
 def as_message(fields):
@@ -60,6 +65,34 @@ def test_a_straight_line_is_straight_again():
     # The drawing itself is good to half a pixel.
     np.testing.assert_allclose(centres, 127 - 0.35 * 258, atol=0.6)
     assert frame.camera == CAMERA
+
+
+def as_taken(image, camera, how):
+    """Give what a camera whose lens distorts takes of what a pinhole camera sees."""
+    k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    pixels = np.indices(image.shape[:2])[::-1].reshape(2, -1).T.astype(np.float64)
+    lens = np.array(camera.distortion)
+    seen = cv2.undistortPoints(pixels[:, None], k, lens, P=k)[:, 0].astype(np.float32)
+    x, y = seen.T.reshape(2, *image.shape[:2])
+    return cv2.remap(image, x, y, how, borderMode=cv2.BORDER_REPLICATE)
+
+
+def test_what_a_distorting_lens_takes_is_solved_as_well_as_what_a_pinhole_takes():
+    depth = np.full((240, 320), 2, np.float32)
+    image = swept(texture(3), 11.0, 0.4)
+    pinhole = deblur(RgbdFrame(image, depth, CAMERA), SolverParams(mode='motion'))
+    camera = replace(CAMERA, distortion=LENS)
+    taken = as_taken(image, camera, cv2.INTER_CUBIC).clip(0, 1)
+    assert np.abs(taken - image).mean() > 0.02
+    info = info_of(CAMERA, d=list(LENS), distortion_model='plumb_bob')
+    pair = replace(pair_of(info, depth), colour=as_message(image_fields(taken, HEADER)))
+    frame = frame_from_pair(pair, Given(rectified=False))
+    for found in (frame, RgbdFrame(taken, depth, camera)):
+        result = deblur(found, SolverParams(mode='motion'))
+        one, other = (flow(m.motion.vector, depth, CAMERA) for m in (result, pinhole))
+        off = min(np.linalg.norm(one - s * other, axis=-1).mean() for s in (1, -1))
+        assert result.outcome is pinhole.outcome is Outcome.SOLVED
+        assert off < 0.5
 
 
 def test_undistorted_depth_is_never_mixed():

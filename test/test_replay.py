@@ -1,5 +1,6 @@
 """From bag to bag with a solver that is known: what is read, what is written, what is refused."""
 
+from dataclasses import replace
 import json
 
 import cv2
@@ -241,6 +242,20 @@ def test_a_camera_info_that_comes_late_serves_from_the_start(tmp_path):
             write_depth(bag, i)
         write_info(bag, FRAMES)
     assert run(tmp_path / 'in', tmp_path / 'out').complete
+
+
+@pytest.mark.parametrize('rectified', [True, False])
+def test_the_lens_is_undone_unless_images_are_rectified(tmp_path, rectified):
+    with BagWriter(tmp_path / 'in') as bag:
+        write_info(bag, camera=replace(CAMERA, distortion=(0.4, 0, 0, 0, 0)))
+        write_colour(bag, 0)
+        write_depth(bag, 0)
+    params = SolverParams(rectified=rectified)
+    replay(tmp_path / 'in', tmp_path / 'out', params=params, solve=solve)
+    found = read_back(tmp_path / 'out')
+    assert not any(found['/deblurred/camera_info'][0][1].d)
+    corner = np.frombuffer(bytes(found['/deblurred/depth'][0][1].data), np.float32)[0]
+    assert np.isnan(corner) != rectified
 
 
 def test_a_camera_that_is_given_counts_and_needs_no_topic(tmp_path):

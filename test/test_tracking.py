@@ -117,6 +117,29 @@ def test_a_jump_back_in_time_starts_anew(ahead):
     assert min(off) < 0.3 and max(off[1:]) < 0.5
 
 
+def test_the_stamp_means_what_is_said():
+    long, short = 0.03, 0.006  # the middles of exposures that end evenly lie unevenly
+
+    def exposure(number):
+        return long if number % 3 else short
+
+    def middle(stamp):
+        number = (stamp - START_NS) // STEP_NS
+        return (stamp - START_NS) / 1e9 - exposure(number) / 2
+
+    off = {}
+    for stamp_at in ('end', 'middle'):
+        frames = [frame(i, middle(START_NS + i * STEP_NS), exposure(i)) for i in range(16)]
+        tracker, missed = Tracker(Knowing(time=middle)), []
+        params = SolverParams(mode='motion', stamp_at=stamp_at)
+        tracker._solve.exposure = 1e-9  # only the neighbours tell
+        for f, n in zip(frames, [*frames[1:], None], strict=True):
+            found = tracker.follow(f, params, n).result.motion.theta / f.exposure
+            missed.append(np.linalg.norm(found - rate(middle(f.stamp_ns))))
+        off[stamp_at] = np.median(missed[4:])
+    assert off['end'] < 0.5 * off['middle']
+
+
 def test_a_camera_that_stands_still_has_no_motion():
     frames = [frame(i, 0.1) for i in range(6)]
     found = followed(frames, solve=Knowing(exposure=1e-6), ahead=True)

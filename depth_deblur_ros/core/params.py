@@ -11,6 +11,7 @@ from depth_deblur_ros.core.data import InputError
 
 MODES = ('full', 'fast', 'motion')
 METHODS = ('spectra', 'paper')
+STAMPS = ('start', 'middle', 'end')
 
 
 def knob(default: float, low: float, high: float, text: str) -> Any:
@@ -47,6 +48,10 @@ class SolverParams:
     gyro_bias: float = knob(0.05, 0.0, 10.0, 'of the gyro, standard deviation [rad/s]')
     gyro_delay_s: float = knob(
         0.0, -1.0, 1.0, "how far the gyro's stamps are behind the camera's, mid-exposure [s]"
+    )
+    rectified: bool = free(True, 'P of camera_info counts; false: K and D, undistorts first')
+    stamp_at: str = choice(
+        'middle', STAMPS, 'which instant of the exposure the stamp of an image means'
     )
     threads: int = knob(2, 1, 256, 'threads of the compiled kernels')
     prior: float = knob(2.7, 0.01, 100.0, 'weight of the image prior: more is smoother [c]')

@@ -30,6 +30,7 @@ from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.joint import refine
 from depth_deblur_ros.core.latent import LatentSteps, restore_coarse_to_fine
+from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.light import light_from_stored, stored_from_light
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
@@ -47,9 +48,10 @@ def deblur(
 
     start: a further motion to start from (the previous frame's, say). Pure: the same input gives
     the same output, but for seconds. One image cannot tell the sign of the motion, and no motion
-    has none: sign_resolved is False. Raises InputError when all depth is missing.
+    has none: sign_resolved is False. Image and depth of a lens with distortion are undistorted
+    first, and come back so. Raises InputError when all depth is missing.
     """
-    params = params or SolverParams()
+    params, frame = params or SolverParams(), undistorted(frame)
     began = time.monotonic()
     with _threads(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
@@ -68,7 +70,7 @@ def restore_known(
     frame: RgbdFrame, motion: Motion, params: SolverParams | None = None
 ) -> DeblurResult:
     """Restore the image under a known motion: the limit of any estimate of the motion."""
-    params = params or SolverParams()
+    params, frame = params or SolverParams(), undistorted(frame)
     began = time.monotonic()
     with _threads(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
