@@ -1,9 +1,12 @@
 """Bags of small messages for the tests, and what readers that are not ours find in them."""
 
+import random
+
 from depth_deblur_ros.bag import BagReader, decoded
 from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, Reader, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
@@ -17,6 +20,26 @@ EXPECTED = [(100 + i, text) for i, text in enumerate(TEXTS)]
 def string(text):
     make = TYPES.types['std_msgs/msg/String']
     return bytes(TYPES.serialize_cdr(make(text), 'std_msgs/msg/String'))
+
+
+WHOLE = [(time, '/text', string(text)) for time, text in EXPECTED]
+NOISE = random.Random(0)
+LONG = [f'{i:02d}' + ''.join(NOISE.choices('abcdefghij', k=20_000)) for i in range(COUNT)]
+BIG = [(100 + i, '/text', string(text)) for i, text in enumerate(LONG)]
+LAYOUTS = {
+    'plain': {'compression': CompressionType.NONE},
+    'lz4': {'compression': CompressionType.LZ4},
+    'zstd': {'compression': CompressionType.ZSTD},
+    'no chunks': {'use_chunking': False, 'enable_data_crcs': True},
+    'no index': {
+        'compression': CompressionType.NONE,
+        'index_types': IndexType.NONE,
+        'use_statistics': False,
+        'use_summary_offsets': False,
+        'repeat_schemas': False,
+        'repeat_channels': False,
+    },
+}
 
 
 def write_rosbag(folder, mode):

@@ -6,35 +6,30 @@ import re
 import struct
 import zlib
 
-from bag_parts import COUNT, EXPECTED, others, raw, read, string, TEXTS, write_mcap, write_rosbag
+from bag_parts import (
+    BIG,
+    COUNT,
+    EXPECTED,
+    LAYOUTS,
+    LONG,
+    others,
+    raw,
+    read,
+    TEXTS,
+    WHOLE,
+    write_mcap,
+    write_rosbag,
+)
+import damage
 from depth_deblur_ros.bag import BagReader
 from depth_deblur_ros.core.data import InputError
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, IndexType
 import pytest
 from rosbags.rosbag2 import CompressionMode
 import zstandard
 
-WHOLE = [(time, '/text', string(text)) for time, text in EXPECTED]
-NOISE = random.Random(0)
-LONG = [f'{i:02d}' + ''.join(NOISE.choices('abcdefghij', k=20_000)) for i in range(COUNT)]
-BIG = [(100 + i, '/text', string(text)) for i, text in enumerate(LONG)]
 ZSTD = b'\x28\xb5\x2f\xfd'
-LAYOUTS = {
-    'plain': {'compression': CompressionType.NONE},
-    'lz4': {'compression': CompressionType.LZ4},
-    'zstd': {'compression': CompressionType.ZSTD},
-    'no chunks': {'use_chunking': False, 'enable_data_crcs': True},
-    'no index': {
-        'compression': CompressionType.NONE,
-        'index_types': IndexType.NONE,
-        'use_statistics': False,
-        'use_summary_offsets': False,
-        'repeat_schemas': False,
-        'repeat_channels': False,
-    },
-}
 
 
 @pytest.fixture(scope='module')
@@ -313,3 +308,13 @@ def test_a_chunk_that_claims_to_be_shorter_than_its_head_is_no_chunk(folder):
     found, damage = raw(damaged(folder, content))
     assert found
     assert damage
+
+
+@pytest.mark.parametrize('kind', damage.KINDS)
+def test_no_reader_finds_more_in_a_bag_damaged_at_random(folder, kind):
+    rng = random.Random(3)
+    for layout in folder.iterdir():
+        if layout.is_file():
+            whole = BIG if layout.name.endswith('big') else WHOLE
+            path = damaged(folder, damage.damaged(layout.read_bytes(), kind, rng))
+            assert not damage.compare(path, set(whole))[2], layout
