@@ -43,6 +43,22 @@ def test_a_straight_blur_is_found_whatever_its_direction(length, angle):
     assert 0.5 < result.quality <= 1
 
 
+@pytest.mark.parametrize('length', [2, 3, 4])
+@pytest.mark.parametrize('angle', [0.4, 1.9])
+def test_a_short_blur_is_found_close_up(length, angle):
+    result = blind_start(swept(texture(1), length, angle, 0.005), DEPTH, CAMERA)
+    assert result.outcome is Outcome.SOLVED
+    assert flow_error(result, sideways(length, angle)) < 0.5
+
+
+@pytest.mark.parametrize('radius', [4, 7])
+def test_a_lens_out_of_focus_is_no_motion(radius):
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    disc = (x * x + y * y <= radius * radius).astype(np.float32)
+    result = blind_start(cv2.filter2D(texture(0), -1, disc / disc.sum()), DEPTH, CAMERA)
+    assert result.outcome is Outcome.FAILED
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_sharp_picture_is_sharp(seed):
     result = blind_start(texture(seed), DEPTH, CAMERA)
@@ -85,8 +101,8 @@ def test_a_guess_good_or_bad_does_no_harm(factor):
 @pytest.mark.parametrize(('near', 'searched'), [(0.8, False), (-1.1, False), (3.0, True)])
 def test_all_is_searched_only_where_the_guess_does_not_hold(near, searched, monkeypatch):
     grey, true = swept(texture(1), 12, 0.3), sideways(12, 0.3)
-    calls, search = [], start._search
-    monkeypatch.setattr(start, '_search', lambda *args: calls.append(args) or search(*args))
+    calls, find = [], start.find
+    monkeypatch.setattr(start, 'find', lambda *args: calls.append(args) or find(*args))
     result = blind_start(grey, DEPTH, CAMERA, Motion.from_vector(near * true.vector))
     assert bool(calls) == searched
     assert flow_error(result, true) < 1

@@ -21,11 +21,12 @@ FURTHER = 3.0  # px of further blur
 ENOUGH = 15_000  # pixels or more that are looked at; the ratio is then good to 0.002
 
 
-def sharpness(grey: FloatImage) -> float:
+def sharpness(grey: FloatImage) -> tuple[float, float]:
     """
-    Give how much further blur weakens the strongest tenth of the edges, least of all directions.
+    Give how much further blur weakens the strongest tenth of the edges: least and most.
 
-    1 = not at all: long motion blur along that direction; 1.1 and more: no blur longer than 2 px.
+    Least of all directions: 1 = not at all, long motion blur along that direction; 1.1 and more:
+    no blur longer than 2 px. Most: 1.05 and less, soft in all directions, which no motion does.
     """
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.6), np.float32)
     step = max(1, math.isqrt(grey.size // ENOUGH))
@@ -37,7 +38,7 @@ def sharpness(grey: FloatImage) -> float:
         steep = np.abs(near)
         strong = steep >= np.percentile(steep, 90)
         ratios.append(float(_rms(near[strong]) / max(_rms(far[strong]), 1e-9)))
-    return min(ratios)
+    return min(ratios), max(ratios)
 
 
 def _difference(image: FloatImage, angle: float, length: float, step: int) -> FloatImage:

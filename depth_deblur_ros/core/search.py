@@ -1,0 +1,225 @@
+"""
+The search: which motion the spectra of one picture's patches fit best.
+
+The score S (evidence.py) is computed at full, half and quarter scale. Each scale proposes motions,
+from a grid over shifts, roll and zoom and from random ones with parallax, refined by a shrinking
+search; all scales together choose, since a false optimum at one scale seldom is one at the next.
+Short blurs are looked at again with the picture's middle at twice its size, where bands up to
+the finest frequency count. docs/method.md (11), (12).
+
+Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
+from depth_deblur_ros.core.evidence import Evidence, gather_spectra, scores, Spectra, thinned
+from depth_deblur_ros.core.templates import PATCH, REACH
+import numpy as np
+
+SCALES = (1, 2, 4)
+CLOSE = 0.5  # the scale at twice the size
+SHARE = {
+    CLOSE: 1.0,
+    1: 1.0,
+    2: 0.5,
+    4: 0.25,
+}  # of a scale in the common score: coarse bands are deep but inexact
+PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
+FEW = 4  # patches; a coarse scale with less has no vote
+MANY = 40  # patches of a scale, of which half are heard on all proposals
+HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that all patches judge; that seeds are of
+SEEDS = 8  # distinct motions that each scale refines
+NEAR = 3.0  # px; how wide it is searched around a guess
+ROOM = 10  # px of templates around the guess, more than the search around it goes
+SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
+ROUNDS, TRIES, SHRINK = 14, 200, 0.78
+SATURATED = 0.98
+CLOSE_SIDES = (240, 320)  # px, rows and columns of the middle that is seen close up, at least
+CLOSE_REACH = 12  # px of templates around no motion, at full scale
+CLOSE_SPREAD = (2.5, 2.5, 1.5, 1.5, 0.5, 0.5)  # px of what is proposed there
+CLOSE_SEEDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """One scale of the search: its evidence, and by how much the picture is smaller."""
+
+    factor: float
+    evidence: Evidence
+
+
+def find(spectra: dict[int, Spectra], guess: Vector | None) -> tuple[Vector, list[Scale]]:
+    """Let each scale propose and all choose; q (6,), and what the scales say of all motions."""
+    scales = _scales(spectra)
+    return _search(scales, guess), scales
+
+
+def find_near(spectra: dict[int, Spectra], guess: Vector) -> tuple[Vector, list[Scale]]:
+    """Find q (6,) around a guess, and what the scales say of the motions there."""
+    scales = _scales(spectra, guess)
+    return _refine(_refine(guess[None], scales, NEAR), scales, 1.0)[0], scales
+
+
+def find_short(scale: Scale, spectra: Spectra, near: Vector | None) -> tuple[Vector, list[Scale]]:
+    """
+    Find a short q (6,), at full scale and close up, around one if it is known.
+
+    scale: of the full picture; spectra: what `close_up` saw.
+    """
+    around, room = (np.zeros(6), CLOSE_REACH) if near is None else (near, ROOM)
+    both = [scale, Scale(CLOSE, spectra.evidence_around(around, round(room / CLOSE)))]
+    known = near is not None
+    found = _refine(around[None], both, NEAR) if known else _best(_short(), both, CLOSE_SEEDS)
+    found = _refine(found, both, 1.0)
+    return found[int(np.argmin(common_score(found, both)))], both
+
+
+def look(
+    grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+) -> dict[int, Spectra]:
+    """Look at each scale that holds enough patches, at the full one always, by its factor."""
+    whole = _whole(grey)
+    found: dict[int, Spectra] = {}
+    for factor in SCALES:
+        width, height = camera.width // factor, camera.height // factor
+        if min(width, height) < PATCH:
+            break
+        spectra = _seen((grey, whole, depth), camera.scaled(width, height), axes, cv2.INTER_AREA)
+        if found and len(spectra.weight) < FEW:
+            break
+        found[factor] = spectra
+    return found
+
+
+def close_up(
+    grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+) -> Spectra:
+    """Look at the picture's middle at twice its size."""
+    rows, columns = (
+        min(side, max(side // 2, least))
+        for side, least in zip(grey.shape, CLOSE_SIDES, strict=True)
+    )
+    top, left = (grey.shape[0] - rows) // 2, (grey.shape[1] - columns) // 2
+    middle = np.s_[top : top + rows, left : left + columns]
+    cut = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=columns, height=rows)
+    images = (grey[middle], _whole(grey[middle]), depth[middle])
+    return _seen(images, cut.scaled(2 * columns, 2 * rows), axes, cv2.INTER_CUBIC)
+
+
+def _seen(
+    images: tuple[FloatImage, FloatImage, FloatImage],
+    camera: CameraIntrinsics,
+    axes: Vector,
+    how: int,
+) -> Spectra:
+    """Look at grey values, what counts of them, and depth at the size of a camera."""
+    size = (camera.width, camera.height)
+    grey, whole, depth = (
+        np.asarray(cv2.resize(array, size, interpolation=way), np.float32)
+        for array, way in zip(images, (how, cv2.INTER_AREA, cv2.INTER_NEAREST), strict=True)
+    )
+    return gather_spectra(grey, whole, depth, camera, axes)
+
+
+def _scales(spectra: dict[int, Spectra], near: Vector | None = None) -> list[Scale]:
+    """Gather the evidence of each scale, of all motions or of those near one."""
+    if near is None:
+        return [Scale(factor, own.evidence()) for factor, own in spectra.items()]
+    return [
+        Scale(factor, own.evidence_around(near, ROOM // factor + 2))
+        for factor, own in spectra.items()
+    ]
+
+
+def _whole(grey: FloatImage) -> FloatImage:
+    """Give 1 where the pixel and its neighbourhood are not saturated, softly falling to 0."""
+    burnt = cv2.GaussianBlur((grey > SATURATED).astype(np.float32), (0, 0), 3)
+    return np.clip(1 - 2 * burnt, 0, 1)
+
+
+def common_score(qs: Vector, scales: list[Scale]) -> Vector:
+    """Give the score (m,) of motions q (m, 6) over all scales, with the price of parallax."""
+    total = PARALLAX_COST * (qs[:, 4] ** 2 + qs[:, 5] ** 2)
+    for scale in scales:
+        total = total + SHARE[scale.factor] * scores(qs, scale.evidence)
+    return np.asarray(total)
+
+
+def _search(scales: list[Scale], guess: Vector | None) -> Vector:
+    """Let each scale propose and all choose; q (6,)."""
+    found = [] if guess is None else [guess]
+    for scale in scales:
+        found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor))
+    return np.asarray(_refine(_choose(np.array(found), scales)[None], scales, 1.0)[0])
+
+
+def _choose(qs: Vector, scales: list[Scale]) -> Vector:
+    """Pick the motion that all scales like best; a scale of few patches has less to say."""
+    total = np.zeros(len(qs))
+    for scale in scales:
+        patches = len(scale.evidence.weight)
+        total += patches / (patches + 1) * scores(qs, scale.evidence)
+    return np.asarray(qs[int(np.argmin(total))])
+
+
+@lru_cache(maxsize=1)
+def _proposals() -> Vector:
+    """Give motions (m, 6) [px] over what one scale can see: a grid, and random with parallax."""
+    steps = np.arange(-REACH + 2, REACH - 1, 2.0)
+    grid = np.stack(
+        np.meshgrid(steps, steps[steps >= 0], np.linspace(-18, 18, 7), np.linspace(-12, 12, 5)), -1
+    ).reshape(-1, 4)
+    grid = np.concatenate([grid, np.zeros((len(grid), 2))], 1)
+    random = np.random.default_rng(0).standard_normal((30000, 6)) * (14, 14, 7, 6, 3, 3)
+    return np.concatenate([grid, random])
+
+
+@lru_cache(maxsize=1)
+def _short() -> Vector:
+    """Give short motions (m, 6) [px]."""
+    return np.random.default_rng(0).standard_normal((6000, 6)) * CLOSE_SPREAD
+
+
+def _seeds(scale: Scale) -> Vector:
+    """Pick the best proposals (n, 6) of a scale that differ by more than 4 of its pixels."""
+    qs = scale.factor * _proposals()
+    if len(scale.evidence.weight) >= MANY:
+        qs = _best(qs, [Scale(scale.factor, thinned(scale.evidence))], HEARD_TWICE)
+    qs = _best(qs, [scale], CANDIDATES)
+    chosen: list[Vector] = []
+    while len(qs) and len(chosen) < SEEDS:
+        chosen.append(qs[0])
+        qs = qs[np.abs(qs - qs[0]).max(1) > 4 * scale.factor]
+    return np.array(chosen)
+
+
+def _best(qs: Vector, scales: list[Scale], count: int) -> Vector:
+    """Give the motions that the scales like best, the best first."""
+    values = common_score(qs, scales)
+    some = np.argpartition(values, count)[:count] if count < len(qs) else np.arange(len(qs))
+    return np.asarray(qs[some[np.argsort(values[some], kind='stable')]])
+
+
+@lru_cache(maxsize=1)
+def _steps() -> Vector:
+    """Give the steps (ROUNDS, TRIES, 6) of the shrinking search, in units of its radius."""
+    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 6)) * SPREAD
+    return np.asarray(steps * SHRINK ** np.arange(ROUNDS)[:, None, None])
+
+
+def _refine(qs: Vector, scales: list[Scale], radius: float) -> Vector:
+    """Shrinking random search around each of qs (n, 6), the same each time; radius [px]."""
+    best, each = common_score(qs, scales), np.arange(len(qs))
+    for steps in _steps():
+        tries = qs[:, None] + radius * steps
+        values = common_score(tries.reshape(-1, 6), scales).reshape(len(qs), -1)
+        k = np.argmin(values, 1)
+        better = values[each, k] < best
+        best = np.where(better, values[each, k], best)
+        qs = np.where(better[:, None], tries[each, k], qs)
+    return qs
