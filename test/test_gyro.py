@@ -33,7 +33,7 @@ def imu(stamp, turn):
 def fed(gyro, wrong=lambda turn: turn, lag=0.0):
     """Let a gyro feel a turning camera at 200 Hz: its own turn is that of the scene, reversed."""
     rng = np.random.default_rng(0)
-    for i in range(-5, 130):
+    for i in range(-5, 180):
         t = i / 200
         turn = wrong(-rate(t - lag)) + BIAS + rng.normal(0, 0.003, 3)
         gyro.take(imu(START_NS + round(1e9 * t), turn))
@@ -77,6 +77,13 @@ def test_a_wrong_gyro_does_no_harm(gyro):
 def test_the_bias_is_found():
     _, tracker = errors()
     assert np.linalg.norm(tracker.gyro.trial.bias - BIAS) < 0.04
+    assert tracker.gyro.trial.passed
+
+
+@pytest.mark.parametrize('lag', [0.005, -0.008, 0.02])
+def test_a_lag_is_found(lag):
+    _, tracker = errors(frames=24, lag=lag)
+    assert tracker.gyro.trial.lag == pytest.approx(lag, abs=0.003)
     assert tracker.gyro.trial.passed
 
 
