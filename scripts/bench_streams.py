@@ -1,7 +1,7 @@
 """
 Measure what tracking tells on the bags of make_streams.py, through replay.
 
-usage: python scripts/bench_streams.py FOLDER [--imu none|good|reversed|late|offset] [--mode MODE]
+usage: python scripts/bench_streams.py FOLDER [--imu KIND] [--mode MODE] [--live]
 
 One line per bag: median error of the exposure; rms error of the angular and the linear velocity
 over that of no motion, frames that tell none counting as such; sign and told in percent.
@@ -17,10 +17,10 @@ import tempfile
 from types import SimpleNamespace
 from typing import Any
 
+from depth_deblur_ros import replay as replaying
 from depth_deblur_ros.bag import BagReader, decoded
 from depth_deblur_ros.core.params import MODES, SolverParams
 from depth_deblur_ros.gyro import Gyro
-from depth_deblur_ros.replay import replay
 import numpy as np
 import numpy.typing as npt
 
@@ -80,6 +80,12 @@ def spoil(kind: str) -> None:
     Gyro.take = spoilt  # type: ignore[method-assign]
 
 
+def look_ahead_no_more() -> None:
+    """Let replay know no more of the following frame than a live camera does."""
+    given = replaying._with_next
+    replaying._with_next = lambda pairs: ((pair, None) for pair, _ in given(pairs))
+
+
 def score(records: list[dict[str, Any]], twists: Array, exposures: Array) -> Score:
     """Compare the estimates of a bag with its truth."""
     found, right = np.zeros_like(twists), []
@@ -105,7 +111,9 @@ def measured(bag: Path, mode: str) -> Score:
     """Replay a bag and score it."""
     with tempfile.TemporaryDirectory() as folder:
         lines = Path(folder) / 'motion.jsonl'
-        replay(bag, Path(folder) / 'out', params=SolverParams(mode=mode), estimates=lines)
+        replaying.replay(
+            bag, Path(folder) / 'out', params=SolverParams(mode=mode), estimates=lines
+        )
         records = [json.loads(line) for line in lines.read_text().splitlines()]
     return score(records, *truth_of(bag))
 
@@ -117,8 +125,11 @@ def main() -> None:
     kinds = ('none', 'good', 'reversed', 'late', 'offset')
     parser.add_argument('--imu', choices=kinds, default='none')
     parser.add_argument('--mode', choices=MODES, default='full')
+    parser.add_argument('--live', action='store_true', help='without looking ahead')
     args = parser.parse_args()
     spoil(args.imu)
+    if args.live:
+        look_ahead_no_more()
     print('| stream | exposure | angular | linear | sign % | told % |\n|---|---|---|---|---|---|')
     for bag in sorted(path for path in args.folder.iterdir() if not path.name.startswith('.')):
         print(f'| {bag.name} {measured(bag, args.mode)}', flush=True)
