@@ -33,6 +33,8 @@ import numpy as np
 REWEIGHTINGS, STEPS = 3, 10  # of the image step
 SETTLING = 5  # reweightings after each of which noise and prior follow the image
 PRIORS = (0.2, 60.0)  # where its weight stays
+DOUBTED = 3.0  # sigma; what is missed by as much counts half
+LEAST_COUNT = 1e-4
 # Least sigma: 8 bit rounding for averaged values; a real camera hides its noise, and more is
 # unexplained there.
 SIGMA_LEAST, SIGMA_MOST = {'linear': 5e-4, 'srgb': 0.012}, 0.1
@@ -55,7 +57,7 @@ class Part:
     """A part of the frame: grey light and depth [m] (H, W), what counts of it, its own camera."""
 
     light: FloatImage
-    counts: FloatImage  # (H, W): 0 where saturated, else 1
+    counts: FloatImage  # (H, W): 0 where saturated, less than 1 where the model is wrong, else 1
     depth: FloatImage
     camera: CameraIntrinsics
     seed: int  # of its noise, which stays the same while the motion changes
@@ -97,15 +99,12 @@ def _posterior(part: Part, p: Vector, reweightings: int, *, follow: bool) -> Pos
     """Run the image step on three planes: the image, and two of noise alone."""
     blur = blur_operator(Motion.from_vector(p), part.depth, part.camera)
     sweep, transfer = blur.sweep, part.camera.transfer
-    height, width = part.light.shape
-    noise = part.slope * _noise(part.seed, height, width)[-1, :, :, :width]
-    data = sweep.blurred_planes(np.stack([part.light, *noise], 2))
-    data[1:] *= part.scales.sigma
-    trust = sweep.blurred_planes(np.repeat(part.trust[..., None], 3, 2))
-    within = sweep.blurred_planes(np.ones((height, width, 3), np.float32))
+    within = sweep.blurred_planes(np.ones((*part.light.shape, 3), np.float32))
     latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
     for _ in range(reweightings):
         sigma = part.scales.sigma
+        data = sweep.blurred_planes(_data(part))
+        trust = sweep.blurred_planes(np.repeat(part.trust[..., None], 3, 2))
         stored = np.repeat(stored_from_light(latent[:1], transfer), 3, 0)
         weight = np.float32(part.scales.prior * sigma**2)
         problem = reweighted(stored, sweep, transfer, trust, weight)
@@ -115,23 +114,33 @@ def _posterior(part: Part, p: Vector, reweightings: int, *, follow: bool) -> Pos
         if follow:
             missing = data - sweep.gather(latent, within)
             missing[1:] -= data[1:]
-            part = replace(part, scales=_followed(part, problem, latent, missing))
-            for planes in (data, latent):
-                planes[1:] *= part.scales.sigma / sigma
+            part = _followed(part, problem, latent, missing)
+            latent[1:] *= part.scales.sigma / sigma
     return Posterior(part, blur, problem, latent)
 
 
-def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: FloatImage) -> Scales:
-    """Give the scales under which data and prior cost as much as their numbers say, (18)."""
+def _data(part: Part) -> FloatImage:
+    """Give the blurred light, and twice the noise that the data may have, (H, W, 3)."""
+    height, width = part.light.shape
+    noise = _noise(part.seed, height, width)[-1, :, :, :width]
+    spread = part.scales.sigma * part.slope / np.sqrt(np.maximum(part.counts, LEAST_COUNT))
+    return np.stack([part.light, *(spread * noise)], 2).astype(np.float32)
+
+
+def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: FloatImage) -> Part:
+    """Give the part with scales by which data and prior cost what their numbers say, (18)."""
     sigma, prior = part.scales.sigma, part.scales.prior
     planes = np.array([1, 0.5, 0.5])
     data = np.square(missing) * problem.trust
     left = float(planes @ data.sum((1, 2), dtype=np.float64)) / max(part.counts.sum(), 1.0)
     rough = float(planes @ _roughness(problem, latent)) / sigma**2
-    return Scales(
+    scales = Scales(
         float(np.clip(math.sqrt(left), SIGMA_LEAST[part.camera.transfer], SIGMA_MOST)),
         float(np.clip(prior / max(rough, 1e-9), *PRIORS)),
     )
+    off = missing[0, :, : part.light.shape[1]] / (part.slope * np.float32(DOUBTED * sigma))
+    counts = np.where(part.counts > 0, 1 / (1 + np.square(off)), np.float32(0))
+    return replace(part, counts=counts, scales=scales)
 
 
 def _roughness(problem: Quadratic, latent: FloatImage) -> Vector:
