@@ -4,8 +4,10 @@ from depth_deblur_ros.core.templates import (
     ACROSS,
     BAND,
     BLOCK,
+    in_blocks,
     matches,
     PATCH,
+    product,
     REACH,
     template_table,
 )
@@ -48,6 +50,16 @@ def test_the_energy_between_whole_pixels_is_that_of_the_template_there(table, ce
         exact = np.square((w * t).sum((1, 2))).mean()
         assert (w * d).sum() - sag == pytest.approx(exact, rel=0.1)
         assert sag > 0
+
+
+@given(rows=st.integers(1, 9), inner=st.integers(1, 40), columns=st.integers(1, 70))
+@settings(max_examples=20)
+def test_products_by_blocks_are_products(rows, inner, columns):
+    rng = np.random.default_rng(rows + inner + columns)
+    left, right = (rng.standard_normal(s, np.float32) for s in ((rows, inner), (inner, columns)))
+    found = product(left, in_blocks(right))
+    np.testing.assert_allclose(found[:, :columns], left @ right, atol=1e-4)
+    assert not found[:, columns:].any()
 
 
 @given(patches=st.integers(1, 9), seed=st.integers(0, 2**32 - 1))

@@ -37,6 +37,7 @@ from depth_deblur_ros.core.templates import (
     HALF,
     matches,
     PATCH,
+    product,
     REACH,
     template_table,
 )
@@ -49,6 +50,7 @@ CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sen
 EVEN = 0.1  # of S: keeps faint templates from winning by their small norm
 MAX_PATCHES = 400
 CHUNK = 256  # motions that are scored together
+FEW = 2 * CHUNK  # motions that one thread scores sooner than it wakes another
 SPARSE = 4  # every so many-th pixel of a patch tells its depth
 
 
@@ -97,7 +99,8 @@ def gather_spectra(
     corners = _corners(grey.shape)
     power, weight = _spectra(grey, valid, corners, table.bins)
     logs = np.log(power + np.float32(1e-12))
-    logs -= (logs @ table.nuisance) @ table.nuisance.T
+    there, back = table.nuisance_blocks
+    logs -= product(product(logs, there)[:, : len(table.nuisance.T)], back)[:, : len(table.bins)]
     np.clip(logs, *CLIP, out=logs)
     weight = weight**0.25
     return Spectra(
@@ -133,7 +136,7 @@ def _spectra(
             cut = np.array([rows[y : y + PATCH] for y in ys[own]]) * window[:, None]
             found = np.fft.fft(cut, axis=1).reshape(len(own), -1)[:, places]
             power[own] += found.real**2 + found.imag**2
-            weight[own] += [window**2 @ square[y : y + PATCH] for y in ys[own]]
+            weight[own] += [(window**2 * square[y : y + PATCH]).sum() for y in ys[own]]
     return power, weight / np.float32(PATCH**2)
 
 
@@ -201,7 +204,11 @@ def scores(qs: Vector, evidence: Evidence) -> Vector:
     c, d = np.zeros(padded.shape[1], np.float32), np.full(padded.shape[1], EVEN, np.float32)
     match, flows = e.match.reshape(len(e.match), -1), e.flow_of_q.reshape(-1, 12)
     table = (e.energy.reshape(-1), e.sag.reshape(-1))
-    _add_up(padded.reshape(-1), match, *table, e.weight, flows, c, d)
+    told = (padded.reshape(-1), match, *table, e.weight, flows, c, d)
+    if c.size <= FEW:
+        _add_some(0, c.size, *told)
+    else:
+        _add_all(*told)
     return np.asarray(-c[:count].astype(np.float64) / np.sqrt(d[:count]))
 
 
@@ -247,10 +254,16 @@ def _add_patch(first, end, q, match, energy, sag, weight, flow, c, d):  # type: 
         store(d, i, load(d, i) + w * where_positive(inside, own, one))
 
 
+@njit(cache=True, nogil=True)
+def _add_some(first, end, q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
+    """Add the patches' C and D at motions `first` to `end` of q (6 * m,); flat but B first."""
+    for b in range(len(weight)):
+        _add_patch(first, end, q, match[b], energy, sag, weight[b], flows[b], c, d)
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def _add_up(q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
-    """Add the patches' C and D at motions q (6 * m,) to c and d (m,); all flat but B first."""
+def _add_all(q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
+    """Add the patches' C and D at motions q (6 * m,) to c and d (m,)."""
     for k in prange(-(-c.size // CHUNK)):
         end = min((k + 1) * CHUNK, c.size)
-        for b in range(len(weight)):
-            _add_patch(k * CHUNK, end, q, match[b], energy, sag, weight[b], flows[b], c, d)
+        _add_some(k * CHUNK, end, q, match, energy, sag, weight, flows, c, d)

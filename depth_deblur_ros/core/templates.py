@@ -41,7 +41,8 @@ class Table:
     """Templates of all flows, 1 px apart: rows v = 0..REACH, columns u = -REACH..REACH, unused."""
 
     bins: npt.NDArray[np.intp]  # (n,) flat indices into the half spectrum
-    nuisance: FloatImage  # (n, k) orthonormal
+    nuisance: FloatImage  # Q (n, k) orthonormal
+    nuisance_blocks: tuple[FloatImage, FloatImage]  # Q and Q', laid out by in_blocks
     templates: FloatImage  # (rows, blocks, n, BLOCK)
     energy: FloatImage  # (rows, ACROSS) D
     sag: FloatImage  # (rows, ACROSS, 2) |T(u + 1) - T(u)|^2 / n, and along v, of each cell
@@ -62,7 +63,8 @@ def template_table() -> Table:
     flat -= nuisance @ (nuisance.T @ flat)
     energy, sag = _energies(t)
     blocks = t.reshape(len(bins), REACH + 1, -1, BLOCK).transpose(1, 2, 0, 3)
-    return Table(bins, nuisance, np.ascontiguousarray(blocks), energy, sag)
+    both = (in_blocks(nuisance), in_blocks(nuisance.T))
+    return Table(bins, nuisance, both, np.ascontiguousarray(blocks), energy, sag)
 
 
 def _row(v: int, bins: npt.NDArray[np.intp]) -> FloatImage:
@@ -100,14 +102,34 @@ def matches(logs: FloatImage, templates: FloatImage, some: Blocks | None = None)
 
     some (rows, blocks): the blocks that are wanted; the others are zero.
     """
-    patches, count = len(logs), logs.shape[1]
-    rows, blocks = templates.shape[:2]
+    rows, blocks, count, _ = templates.shape
     wanted = np.arange(rows * blocks) if some is None else np.flatnonzero(some)
-    padded = np.zeros((-(-patches // 4) * 4, count), np.float32)
-    np.divide(logs, np.float32(count), out=padded[:patches])
-    match = np.zeros((len(padded), rows * blocks * BLOCK), np.float32)
-    _match(padded, templates.reshape(rows * blocks, -1), wanted, match)
-    return match[:patches].reshape(patches, rows, -1)
+    found = product(logs / np.float32(count), templates.reshape(-1, count, BLOCK), wanted)
+    return found.reshape(len(logs), rows, -1)
+
+
+def in_blocks(matrix: FloatImage) -> FloatImage:
+    """Lay out a matrix (n, m) as (blocks, n, BLOCK), the last block filled up with zeros."""
+    n, m = matrix.shape
+    padded = np.pad(matrix, [(0, 0), (0, -m % BLOCK)])
+    return np.ascontiguousarray(padded.reshape(n, -1, BLOCK).swapaxes(0, 1))
+
+
+def product(
+    left: FloatImage, blocks: FloatImage, wanted: npt.NDArray[np.intp] | None = None
+) -> FloatImage:
+    """
+    Multiply left (B, n) by a matrix in blocks; (B, columns of all blocks), unwanted ones zero.
+
+    On numba's threads: a BLAS would keep its own, which wait by spinning.
+    """
+    if wanted is None:
+        wanted = np.arange(len(blocks))
+    padded = np.zeros((-(-len(left) // 4) * 4, left.shape[1]), np.float32)
+    padded[: len(left)] = left
+    found = np.zeros((len(padded), len(blocks) * BLOCK), np.float32)
+    _multiply(padded, blocks.reshape(len(blocks), -1), wanted, found)
+    return found[: len(left)]
 
 
 def blocks_around(flow: Vector, room: int) -> Blocks:
@@ -125,21 +147,21 @@ def blocks_around(flow: Vector, room: int) -> Blocks:
 
 
 @njit(cache=True, nogil=True)
-def _match_block(first, logs, templates, out):  # type: ignore[no-untyped-def]
-    """Multiply four log-spectra by a block of templates (n * BLOCK,)."""
+def _multiply_four(first, left, block, out):  # type: ignore[no-untyped-def]
+    """Multiply four rows by a block (n * BLOCK,)."""
     a = a2 = b = b2 = c = c2 = d = d2 = splat(np.float32(0))
-    for k in range(logs.shape[1]):
-        t, t2 = load(templates, k * BLOCK), load(templates, k * BLOCK + WIDTH)
-        y = splat(logs[first, k])
+    for k in range(left.shape[1]):
+        t, t2 = load(block, k * BLOCK), load(block, k * BLOCK + WIDTH)
+        y = splat(left[first, k])
         a += y * t
         a2 += y * t2
-        y = splat(logs[first + 1, k])
+        y = splat(left[first + 1, k])
         b += y * t
         b2 += y * t2
-        y = splat(logs[first + 2, k])
+        y = splat(left[first + 2, k])
         c += y * t
         c2 += y * t2
-        y = splat(logs[first + 3, k])
+        y = splat(left[first + 3, k])
         d += y * t
         d2 += y * t2
     store(out, 0, a)
@@ -153,12 +175,12 @@ def _match_block(first, logs, templates, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _match(logs, templates, wanted, match):  # type: ignore[no-untyped-def]
-    """Write logs (4 m, n) times templates (blocks, n * BLOCK) into match (4 m, blocks * BLOCK)."""
+def _multiply(left, blocks, wanted, found):  # type: ignore[no-untyped-def]
+    """Write left (4 m, n) times wanted blocks (k, n * BLOCK) into found (4 m, k * BLOCK)."""
     for i in prange(wanted.size):
         k = wanted[i]
         out = np.empty(4 * BLOCK, np.float32)
-        for first in range(0, logs.shape[0], 4):
-            _match_block(first, logs, templates[k], out)
+        for first in range(0, left.shape[0], 4):
+            _multiply_four(first, left, blocks[k], out)
             for j in range(4 * BLOCK):
-                match[first + j // BLOCK, k * BLOCK + j % BLOCK] = out[j]
+                found[first + j // BLOCK, k * BLOCK + j % BLOCK] = out[j]
