@@ -17,7 +17,7 @@ from depth_deblur_ros.glide import Glide
 from depth_deblur_ros.shutter import agree, Exposure, Shutter
 import numpy as np
 
-SURE = 8.0  # log-odds at which the sign is told
+SURE = 6.0  # log-odds at which the sign is told
 CLEAR = 16.0  # squared distance from zero at which neighbours may claim a motion
 TINY = 1e-12
 ODD = 40.0  # squared distance in 5 dimensions beyond which p and u do not belong together
