@@ -12,15 +12,21 @@ Notation: p (6,) motion; g_k, H_k slope and curvature of part k; C_0 the start's
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 import math
+from typing import TypeVar
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vector
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+from numba import get_num_threads, set_num_threads
 import numpy as np
+
+Result = TypeVar('Result')
 
 READABLE = 24.0  # px; longer blurs are refined at half the size, or less
 BUDGET = 80_000  # px that are looked at: more of them hardly change the motion
@@ -50,7 +56,7 @@ def refine(
 
     certainty = np.asarray(np.linalg.inv(start.covariance), np.float64)
     parts = _parts(light, depth, camera, length(start.vector))
-    parts = [settled(part, start.vector) for part in parts]
+    parts = _each(lambda part: settled(part, start.vector), parts)
     return _moved(parts, start.vector, certainty, length)
 
 
@@ -58,10 +64,9 @@ def _moved(
     parts: list[Part], start: Vector, certainty: Vector, length: Callable[[Vector], float]
 ) -> Motion:
     """Go where the slope of the likelihood and the pull of the start balance."""
-    found = [posterior(part, start) for part in parts]
-    slopes, images = zip(*map(slope_of, found), strict=True)
-    bends = np.array([curvature_of(*pair) for pair in zip(found, images, strict=True)])
-    bend, gs, p = bends.sum(0), np.array(slopes), start
+    slopes, curvatures = zip(*_each(lambda part: _slope_and_bend(part, start), parts), strict=True)
+    bends, gs, p = np.array(curvatures), np.array(slopes), start
+    bend = bends.sum(0)
     for k in range(MOVES):
         soft = _softening(gs, bends)
         force = gs.sum(0) / soft + certainty @ (p - start)
@@ -70,9 +75,31 @@ def _moved(
         p = p + move
         if length(move) < LEAST_MOVE or k == MOVES - 1:
             break
-        last, gs = gs.sum(0), np.array([slope_of(posterior(part, p))[0] for part in parts])
+        last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
     return Motion.from_vector(p, np.linalg.inv(bend / soft + certainty))
+
+
+def _slope(part: Part, p: Vector) -> Vector:
+    return slope_of(posterior(part, p))[0]
+
+
+def _slope_and_bend(part: Part, p: Vector) -> tuple[Vector, Vector]:
+    found = posterior(part, p)
+    slope, image = slope_of(found)
+    return slope, curvature_of(found, image)
+
+
+def _each(work: Callable[[Part], Result], parts: list[Part]) -> list[Result]:
+    """Work on the parts side by side: they are too small for two threads to share one."""
+    threads = get_num_threads()
+
+    def alone(part: Part) -> Result:
+        set_num_threads(max(1, threads // len(parts)))
+        return work(part)
+
+    with ThreadPoolExecutor(min(threads, len(parts))) as pool:
+        return list(pool.map(alone, parts))
 
 
 def _softening(gs: Vector, bends: Vector) -> float:

@@ -197,7 +197,8 @@ def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
     missing, slope = blur_and_slope(blur.motion[:6].astype(np.float64), latent, blur)
     missing[..., 0] -= part.light
     missing *= part.trust[..., None] * np.array([1, 0.5, 0.5], np.float32)
-    g = slope.reshape(-1, 6).T.astype(np.float64) @ missing.reshape(-1).astype(np.float64)
+    # einsum, not BLAS, whose threads spin for long after such short work.
+    g = np.einsum('nk,n->k', slope.reshape(-1, 6), missing.reshape(-1), dtype=np.float64)
     return g / part.scales.sigma**2, slope[..., 0, :]
 
 
@@ -212,5 +213,5 @@ def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
         answered = columns - sweep.gather(z, np.ones_like(columns))
         rest[..., half] = np.moveaxis(answered, 0, 2)[:, :width]
     weighted = found.part.trust[..., None] * slope
-    h = weighted.reshape(-1, 6).T.astype(np.float64) @ rest.reshape(-1, 6).astype(np.float64)
+    h = np.einsum('ni,nj->ij', weighted.reshape(-1, 6), rest.reshape(-1, 6), dtype=np.float64)
     return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2
