@@ -132,6 +132,23 @@ def test_one_version_everywhere():
     assert releases[0] == version
 
 
+def test_package_xml_and_setup_py_need_the_same():
+    """But for the libraries of bags, which rosdep does not know everywhere."""
+    same = {'opencv-python-headless': 'opencv', 'PyYAML': 'yaml'}
+    bags = {'lz4', 'mcap', 'rosbags', 'zstandard'}
+    text = (ROOT / 'setup.py').read_text()
+    listed = re.findall(r"'([\w-]+)", re.search(r'install_requires=\[(.*?)\]', text, re.S)[1])
+    by_pip = {same.get(name, name) for name in listed} - bags - {'setuptools'}
+    root = ET.parse(ROOT / 'package.xml').getroot()
+    keys = [found.text for found in root.findall('depend')]
+    assert by_pip == {k.removeprefix('python3-') for k in keys if k.startswith('python3-')}
+    used = {m.split('.')[0] for m in imports(PACKAGE / 'node.py')} & ROS
+    assert {k for k in keys if not k.startswith('python3-')} == used
+    readme = (ROOT / 'README.md').read_text()
+    for key in [*keys, *(found.text for found in root.findall('test_depend'))]:
+        assert f'`{key}`' in readme, f'README.md does not list {key}'
+
+
 @pytest.mark.parametrize(
     'name', ['README.md', 'CONTRIBUTING.md', *Path(ROOT / 'docs').glob('*.md')]
 )
