@@ -46,13 +46,14 @@ def review(
     estimates: Path | None = None,
     lost: Mapping[str, int] | None = None,
     slop_s: float = 0.02,
+    rectified: bool = True,
 ) -> Run:
     """
     Read what a replay of `bag` left in `out`.
 
-    camera and topics as replay takes them; estimates, its file of that name, adds the energies;
-    lost counts the colour frames without a pair, as replay does (default: those between the first
-    result and the last).
+    camera, topics and rectified as replay takes them; estimates, its file of that name, adds the
+    energies; lost counts the colour frames without a pair, as replay does (default: those between
+    the first result and the last).
     """
     with BagReader(out) as results:
         notes = _notes(results)
@@ -68,7 +69,7 @@ def review(
         shots = []
         for pair in pairs.pairs(min(notes), max(notes) + round(slop_s * 1e9) + 1):
             if pair.log_ns in images:
-                frame = frame_from_pair(pair, Given(camera))
+                frame = frame_from_pair(pair, Given(camera, rectified=rectified))
                 image, depth = images.pop(pair.log_ns)
                 shots.append(shot_of(frame, _result(chosen[pair.log_ns], image, depth)))
         truth = _true_twists(source, ordered)

@@ -1,5 +1,6 @@
 """A replayed bag read back: every frame, its motion with its spread, and the truth."""
 
+from dataclasses import replace
 import json
 
 from depth_deblur_ros import cli
@@ -134,6 +135,23 @@ def test_pictures_are_those_of_frames_that_went_through(tmp_path):
     assert len(run.shots) == SHOTS
     taken = {shot.stamp_ns for shot in run.shots}
     assert START in taken and START + 3 * STEP not in taken
+
+
+def filled(frame, params):
+    """Pretend as solve does, without holes."""
+    return replace(solve(frame, params), depth=DEPTH)
+
+
+def test_what_a_distorting_lens_took_is_shown_undistorted(tmp_path, monkeypatch):
+    image = np.repeat(np.tile(np.linspace(0, 1, 64, dtype=np.float32), (48, 1))[..., None], 3, 2)
+    lens = replace(CAMERA, distortion=(0.5, 0, 0, 0, 0))
+    monkeypatch.setitem(globals(), 'IMAGE', image)
+    monkeypatch.setitem(globals(), 'CAMERA', lens)
+    bag, params = write_bag(tmp_path / 'in'), SolverParams(rectified=False)
+    replay(bag, tmp_path / 'out', params=params, solve=filled)
+    run = review(bag, tmp_path / 'out', rectified=False)
+    first = run.shots[0].pictures
+    assert first['blurred'] == first['sharp']  # as the solver gives it back
 
 
 def test_colour_frames_without_a_pair_are_counted(tmp_path):
