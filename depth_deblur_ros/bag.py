@@ -118,7 +118,9 @@ class BagReader:
             return [self.path]
         found = {p.name for p in self.path.iterdir() if p.name.endswith(('.mcap', '.mcap.zstd'))}
         if not found:
-            raise InputError(f'{self.path} holds no .mcap file: not an mcap bag')
+            sqlite = any(self.path.glob('*.db3*'))
+            why = 'a bag in SQLite; rosbags-convert makes it one' if sqlite else 'not an mcap bag'
+            raise InputError(f'{self.path} holds no .mcap file: {why}')
         listed, self._stated = _metadata(self.path)
         self._missing += [f'{name} is missing from the bag' for name in sorted(listed - found)]
         # A crash leaves a file unlisted, or a packed copy half written beside its original.

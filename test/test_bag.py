@@ -231,3 +231,9 @@ def test_copied_messages_keep_type_and_quality_of_service(tmp_path):
         'own_msgs/msg/Outer',
         True,
     )
+
+
+def test_a_bag_in_sqlite_is_refused_with_a_way_out(tmp_path):
+    (tmp_path / 'old_0.db3').write_bytes(b'SQLite format 3')
+    with pytest.raises(InputError, match='a bag in SQLite; rosbags-convert makes it one'):
+        BagReader(tmp_path)
