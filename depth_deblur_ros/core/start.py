@@ -34,14 +34,16 @@ SHORT_TRUST = 0.11  # least -S at full scale of a short blur
 CLOSE_BELOW = 9.0  # px; shorter blurs are looked at close up
 CLOSE_TRUST = 0.25  # least common -S at full scale and close up
 LONG_TRUST = 0.2  # least common -S of a long blur
+ALONE_TRUST = 0.14  # where the full scale is the only one
 DOUBT = 1.3  # times that where the picture looks sharp
 CLEARLY_SHARP, RATHER_SHARP = (
     1.15,
     1.065,
 )  # trust.sharpness: nothing to search; no motion and no blur
 OUT_OF_FOCUS = 1.07  # trust.sharpness across the motion, which leaves that as it is
-LONG = 20.0  # px; no picture with such a blur
-EDGED = 1.035  # has edges that sharp
+EDGED = 1.035  # edges of a picture with so little blur that it is seen close up alone
+LONG = 20.0  # px; no picture with such a blur is EDGED
+SMEARED, SMEAR = 1.01, 10.0  # edges that no blur below so many px leaves
 BELIEF = 0.4  # common -S at which a motion is taken for certain
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
@@ -83,7 +85,7 @@ def blind_start(
     first = np.asarray(np.linalg.solve(axes, guess.vector)) if guess else None
     q, scales = _found(spectra, first, length, edges)
     trusted = _trusted(q, length(q), scales, edges)
-    if not trusted or length(q) < CLOSE_BELOW:
+    if edges > EDGED if not trusted else length(q) < CLOSE_BELOW:
         close = close_up(grey, depth, camera, axes)
         closer, both = find_short(scales[0], close, q if trusted else None)
         if _short_trusted(closer, length(closer), both):
@@ -112,12 +114,12 @@ def _found(
 
 def _trusted(q: Vector, length: float, scales: list[Scale], edges: float) -> bool:
     """Tell whether the bands are deep enough for a blur of this length [px]."""
-    if length < SHORTEST:
+    if length < SHORTEST or (length < SMEAR and edges < SMEARED):
         return False
     if length < SHORT:
         return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
     sharp = edges > (EDGED if length > LONG else RATHER_SHARP)
-    needed = LONG_TRUST * (DOUBT if sharp else 1)
+    needed = (LONG_TRUST if len(scales) > 1 else ALONE_TRUST) * (DOUBT if sharp else 1)
     return bool(common_score(q[None], scales)[0] < -needed)
 
 
