@@ -42,9 +42,11 @@ CLEARLY_SHARP, RATHER_SHARP = (
 )  # trust.sharpness: nothing to search; no motion and no blur
 OUT_OF_FOCUS = 1.07  # trust.sharpness across the motion, which leaves that as it is
 EDGED = 1.035  # edges of a picture with so little blur that it is seen close up alone
-LONG = 20.0  # px; no picture with such a blur is EDGED
+LONG, LONGEST = 20.0, 30.0  # px; few pictures, and none, with such a blur are EDGED
 SMEARED, SMEAR = 1.01, 10.0  # edges that no blur below so many px leaves
 BELIEF = 0.4  # common -S at which a motion is taken for certain
+# Where the full scale is the only one, what has less quality is wrong one time in four: variance.
+LONELY, LONELY_SPREAD = 0.45, 25.0
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
 BEND = 1.0  # px, step of the second differences
@@ -93,9 +95,10 @@ def blind_start(
     if not trusted:
         return _nothing(Outcome.SHARP if edges > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
-    return Start(
-        Motion.from_vector(axes @ q, _covariance(q, scales, axes)), Outcome.SOLVED, quality
-    )
+    covariance = _covariance(q, scales, axes)
+    if len(scales) == 1 and quality < LONELY:
+        covariance = LONELY_SPREAD * covariance
+    return Start(Motion.from_vector(axes @ q, covariance), Outcome.SOLVED, quality)
 
 
 def _found(
@@ -115,6 +118,8 @@ def _found(
 def _trusted(q: Vector, length: float, scales: list[Scale], edges: float) -> bool:
     """Tell whether the bands are deep enough for a blur of this length [px]."""
     if length < SHORTEST or (length < SMEAR and edges < SMEARED):
+        return False
+    if length > LONGEST and edges > EDGED:
         return False
     if length < SHORT:
         return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
