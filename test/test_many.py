@@ -16,6 +16,7 @@ import pytest
 from test_replay import FRAMES, write_bag
 
 SAMPLE = Path(__file__).resolve().parents[1] / 'bags/sample'
+LONG = SolverParams(reweightings=10, cg_steps=30)  # some seconds for each frame
 QUICK = ['--mode', 'motion', '--neighbours', 'ignore']
 
 
@@ -137,7 +138,7 @@ def test_a_process_that_dies_costs_its_own_bag_alone(bags, tmp_path):
 
 
 def test_an_exception_ends_what_runs_and_keeps_what_is_done(tmp_path):
-    jobs = jobs_of([SAMPLE], Job(SAMPLE, tmp_path, SolverParams(mode='motion')))
+    jobs = jobs_of([SAMPLE], Job(SAMPLE, tmp_path, LONG))
     begun = time.monotonic()
     with pytest.raises(KeyboardInterrupt), Pool(1) as pool:
         future = pool.submit(jobs[0])
@@ -151,8 +152,9 @@ def test_an_exception_ends_what_runs_and_keeps_what_is_done(tmp_path):
 
 def test_nothing_outlives_a_parent_that_is_killed(tmp_path):
     code = (
+        'from depth_deblur_ros.core.params import SolverParams; '
         'from depth_deblur_ros.job import Job, run_apart; from pathlib import Path; '
-        f'run_apart(Job(Path({str(SAMPLE)!r}), Path({str(tmp_path / "out")!r})), '
+        f'run_apart(Job(Path({str(SAMPLE)!r}), Path({str(tmp_path / "out")!r}), {LONG!r}), '
         'lambda process: print(process.pid, flush=True))'
     )
     parent = subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE, text=True)

@@ -58,7 +58,8 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
     lost = {role: int(values[f'{role} lost in transport']) for role in roles}
     queued = {role: int(values[f'{role} lost in a full queue']) for role in roles}
     late = np.array([s for s in seen if s[0] > min(SETTLED_S, SECONDS / 2)])
-    slope = np.polyfit(*late.T, 1)[0]
+    # A leak goes on in both halves; a table or an arena that is made late is a step in one.
+    slope = min(np.polyfit(*half.T, 1)[0] for half in np.array_split(late, 2))
     figures = {
         'sent': sent,
         'lost in transport': lost,

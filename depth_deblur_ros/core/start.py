@@ -43,7 +43,7 @@ CLEARLY_SHARP, RATHER_SHARP = (
 OUT_OF_FOCUS = 1.07  # trust.sharpness across the motion, which leaves that as it is
 EDGED = 1.035  # edges of a picture with so little blur that it is seen close up alone
 LONG, LONGEST = 20.0, 30.0  # px; few pictures, and none, with such a blur are EDGED
-SMEARED, SMEAR = 1.01, 10.0  # edges that no blur below so many px leaves
+SMEARED, SMEAR = 1.005, 8.0  # edges that no blur below so many px leaves
 BELIEF = 0.4  # common -S at which a motion is taken for certain
 # Where the full scale is the only one, what has less quality is wrong one time in four: variance.
 LONELY, LONELY_SPREAD = 0.45, 25.0
