@@ -133,6 +133,7 @@ def run_apart(job: Job, begun: Callable[[subprocess.Popen[bytes]], None] | None 
     """Do a job in a process of its own, which begun is told of; it ends when this one does."""
     with subprocess.Popen(
         [sys.executable, *APART],
+        bufsize=0,  # nothing is left to write when the pipe is closed
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
