@@ -1,5 +1,10 @@
 """The joint refinement: nearer to the truth than its start, and nowhere without a reason."""
 
+import os
+from pathlib import Path
+import subprocess
+import sys
+
 from depth_deblur_ros.core import joint
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
@@ -112,3 +117,23 @@ def test_the_curvature_follows_a_quadratic():
     np.testing.assert_allclose(bend, true, atol=1e-6)
     wild = joint._bent(first, first, np.eye(6)[0], 50 * np.eye(6)[0])
     assert np.linalg.eigvalsh(wild).max() <= joint.BENDS[1] + 1e-9
+
+
+def test_the_parts_are_refined_where_numba_has_no_openmp():
+    code = (
+        'import numba, test_joint as t; found = t.refine(t.blurred(t.TRUTH), t.DEPTH, t.CAMERA, '
+        't.start(0.9 * t.TRUTH)); print(numba.threading_layer(), t.off(found.vector))'
+    )
+    plainest = {**os.environ, 'NUMBA_THREADING_LAYER': 'workqueue'}
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        cwd=Path(__file__).parent,
+        env=plainest,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    layer, error = done.stdout.split()
+    assert layer == 'workqueue'
+    assert float(error) < 0.4 * off(0.9 * TRUTH)

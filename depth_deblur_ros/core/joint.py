@@ -23,7 +23,11 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vec
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
-from numba import get_num_threads, set_num_threads
+from numba import (
+    get_num_threads,
+    set_num_threads,
+    threading_layer,  # type: ignore[attr-defined]
+)
 import numpy as np
 
 Result = TypeVar('Result')
@@ -93,7 +97,9 @@ def _slope_and_bend(part: Part, p: Vector) -> tuple[Vector, Vector]:
 
 def _each(work: Callable[[Part], Result], parts: list[Part]) -> list[Result]:
     """Work on the parts side by side: they are too small for two threads to share one."""
-    threads = get_num_threads()
+    threads = get_num_threads()  # starts numba's threads, if none run yet
+    if threading_layer() == 'workqueue':  # without OpenMP; ends the process of two callers
+        return [work(part) for part in parts]
 
     def alone(part: Part) -> Result:
         set_num_threads(max(1, threads // len(parts)))
