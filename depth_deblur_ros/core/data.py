@@ -90,6 +90,11 @@ class CameraIntrinsics:
             height=height,
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> CameraIntrinsics:
+        """Give the same camera for a part of the image, width x height from its corner."""
+        cx, cy = self.cx - left, self.cy - top
+        return replace(self, cx=cx, cy=cy, width=width, height=height)
+
 
 @dataclass(frozen=True, eq=False)
 class RgbdFrame:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 import math
 from typing import TypeVar
@@ -23,10 +22,10 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vec
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
-from numba import (
+from numba import (  # type: ignore[attr-defined]
     get_num_threads,
     set_num_threads,
-    threading_layer,  # type: ignore[attr-defined]
+    threading_layer,
 )
 import numpy as np
 
@@ -151,9 +150,7 @@ def _parts(
         quarter = light[top : top + height, left : left + width]
         y, x = _busiest(stored_from_light(quarter, camera.transfer), rows, columns)
         box = np.s_[top + y : top + y + rows, left + x : left + x + columns]
-        cut = replace(
-            camera, cx=camera.cx - left - x, cy=camera.cy - top - y, width=columns, height=rows
-        )
+        cut = camera.cropped(left + x, top + y, columns, rows)
         own = np.ascontiguousarray(light[box])
         counts = (stored_from_light(own, camera.transfer) < SATURATED).astype(np.float32)
         parts.append(Part(own, counts, np.ascontiguousarray(depth[box]), cut, k))

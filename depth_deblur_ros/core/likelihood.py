@@ -20,7 +20,7 @@ J x = d (A_p x) / d p.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 import math
 
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
@@ -28,6 +28,7 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vec
 from depth_deblur_ros.core.latent import conjugate_gradients, Quadratic, reweighted
 from depth_deblur_ros.core.light import light_slope, stored_from_light
 from depth_deblur_ros.core.motion import blur_and_slope
+from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 
 REWEIGHTINGS, STEPS = 3, 10  # of the image step
@@ -63,7 +64,7 @@ class Part:
     seed: int  # of its noise, which stays the same while the motion changes
     scales: Scales = Scales()
 
-    @property
+    @cached_property
     def slope(self) -> FloatImage:
         """Give l' (H, W), by which noise of stored values becomes noise of light."""
         transfer = self.camera.transfer
@@ -101,10 +102,9 @@ def _posterior(part: Part, p: Vector, reweightings: int, *, follow: bool) -> Pos
     sweep, transfer = blur.sweep, part.camera.transfer
     within = sweep.blurred_planes(np.ones((*part.light.shape, 3), np.float32))
     latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
+    data, trust = _observed(part, sweep)
     for _ in range(reweightings):
         sigma = part.scales.sigma
-        data = sweep.blurred_planes(_data(part))
-        trust = sweep.blurred_planes(np.repeat(part.trust[..., None], 3, 2))
         stored = np.repeat(stored_from_light(latent[:1], transfer), 3, 0)
         weight = np.float32(part.scales.prior * sigma**2)
         problem = reweighted(stored, sweep, transfer, trust, weight)
@@ -115,16 +115,19 @@ def _posterior(part: Part, p: Vector, reweightings: int, *, follow: bool) -> Pos
             missing = data - sweep.gather(latent, within)
             missing[1:] -= data[1:]
             part = _followed(part, problem, latent, missing)
+            data, trust = _observed(part, sweep)
             latent[1:] *= part.scales.sigma / sigma
     return Posterior(part, blur, problem, latent)
 
 
-def _data(part: Part) -> FloatImage:
-    """Give the blurred light, and twice the noise that the data may have, (H, W, 3)."""
+def _observed(part: Part, sweep: Sweep) -> tuple[FloatImage, FloatImage]:
+    """Give planes of the blurred light and twice the noise that it may have, and of W."""
     height, width = part.light.shape
     noise = _noise(part.seed, height, width)[-1, :, :, :width]
     spread = part.scales.sigma * part.slope / np.sqrt(np.maximum(part.counts, LEAST_COUNT))
-    return np.stack([part.light, *(spread * noise)], 2).astype(np.float32)
+    data = np.stack([part.light, *(spread * noise)], 2).astype(np.float32)
+    trust = np.repeat(part.trust[..., None], 3, 2)
+    return sweep.blurred_planes(data), sweep.blurred_planes(trust)
 
 
 def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: FloatImage) -> Part:

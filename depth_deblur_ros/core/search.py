@@ -12,7 +12,7 @@ Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -106,7 +106,7 @@ def close_up(
     )
     top, left = (grey.shape[0] - rows) // 2, (grey.shape[1] - columns) // 2
     middle = np.s_[top : top + rows, left : left + columns]
-    cut = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=columns, height=rows)
+    cut = camera.cropped(left, top, columns, rows)
     images = (grey[middle], _whole(grey[middle]), depth[middle])
     return _seen(images, cut.scaled(2 * columns, 2 * rows), axes, cv2.INTER_CUBIC)
 
