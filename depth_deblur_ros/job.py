@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import _thread
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -133,7 +134,7 @@ def run_apart(job: Job, begun: Callable[[subprocess.Popen[bytes]], None] | None 
     """Do a job in a process of its own, which begun is told of; it ends when this one does."""
     with subprocess.Popen(
         [sys.executable, *APART],
-        bufsize=0,  # nothing is left to write when the pipe is closed
+        bufsize=0,  # so that closing the pipe to a dead process writes nothing
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -142,11 +143,8 @@ def run_apart(job: Job, begun: Callable[[subprocess.Popen[bytes]], None] | None 
         assert process.stdin and process.stdout
         if begun:
             begun(process)
-        try:
+        with suppress(BrokenPipeError):  # it has ended already; what it said tells why
             process.stdin.write(pickle.dumps(job))
-            process.stdin.flush()
-        except BrokenPipeError:
-            pass  # it has ended already; what it said tells why
         said = process.stdout.read().decode(errors='replace')
     return Done(process.returncode, said.strip())
 

@@ -23,7 +23,7 @@ from depth_deblur_ros.core.data import (
     Outcome,
     RgbdFrame,
 )
-from depth_deblur_ros.core.geometry import blur_length, flow
+from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.params import MODES, SolverParams
 from depth_deblur_ros.core.solver import deblur
 import numpy as np
@@ -76,14 +76,11 @@ def take(number: int) -> Shot:
 def deviations(shot: Shot, result: DeblurResult) -> tuple[Array, float]:
     """Give the error of each axis (6,) in standard deviations, and of the flow [px]."""
     found, true, depth = result.motion, shot.motion.vector, result.depth
-    misses = [
-        np.hypot(*np.moveaxis(flow(found.vector - s * true, depth, CAMERA), 2, 0)).mean()
-        for s in (1, -1)
-    ]
+    misses = [blur_length(found.vector - s * true, depth, CAMERA) for s in (1, -1)]
     sign = 1 if misses[0] <= misses[1] else -1
     assert found.covariance is not None
     spread = np.sqrt(np.diag(found.covariance))
-    return np.asarray((found.vector - sign * true) / spread), float(min(misses))
+    return np.asarray((found.vector - sign * true) / spread), min(misses)
 
 
 def plotted(errors: Array) -> str:

@@ -87,7 +87,8 @@ def blind_start(
     first = np.asarray(np.linalg.solve(axes, guess.vector)) if guess else None
     q, scales = _found(spectra, first, length, edges)
     trusted = _trusted(q, length(q), scales, edges)
-    if edges > EDGED if not trusted else length(q) < CLOSE_BELOW:
+    look_closer = length(q) < CLOSE_BELOW if trusted else edges > EDGED
+    if look_closer:
         close = close_up(grey, depth, camera, axes)
         closer, both = find_short(scales[0], close, q if trusted else None)
         if _short_trusted(closer, length(closer), both):
@@ -117,9 +118,9 @@ def _found(
 
 def _trusted(q: Vector, length: float, scales: list[Scale], edges: float) -> bool:
     """Tell whether the bands are deep enough for a blur of this length [px]."""
-    if length < SHORTEST or (length < SMEAR and edges < SMEARED):
-        return False
-    if length > LONGEST and edges > EDGED:
+    too_soft = length < SMEAR and edges < SMEARED
+    too_sharp = length > LONGEST and edges > EDGED
+    if length < SHORTEST or too_soft or too_sharp:
         return False
     if length < SHORT:
         return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
