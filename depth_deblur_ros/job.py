@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import os
 from pathlib import Path
 import pickle
+import signal
 import subprocess
 import sys
 import threading
@@ -151,6 +152,8 @@ def run_apart(job: Job, begun: Callable[[subprocess.Popen[bytes]], None] | None 
 
 def job_from_parent() -> Job:
     """Take the job that run_apart sent; from then on the parent's end interrupts this process."""
+    # A shell starts what it puts in the background deaf to interrupts, and that is handed down.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     source = sys.stdin.buffer
     try:
         job = pickle.load(source)

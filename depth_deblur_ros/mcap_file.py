@@ -224,7 +224,9 @@ class McapFile:
 
     def _index(self, data: bytes) -> None:
         """Take in how many messages of a channel the last chunk or gap holds, and their times."""
-        times = [time for time, _ in struct.iter_unpack('<QQ', data[6 : len(data) // 16 * 16 + 6])]
+        entries = data[6:]
+        whole = entries[: len(entries) // 16 * 16]
+        times = [time for time, _ in struct.iter_unpack('<QQ', whole)]
         self._indexed[int.from_bytes(data[:2], 'little')] += len(times)
         if self.blocks and self.blocks[-1].counts is self._indexed:
             block = self.blocks[-1]

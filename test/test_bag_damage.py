@@ -296,12 +296,27 @@ def test_garbage_never_crashes_the_reader(folder, seed):
         assert len(list(bag.messages(bag.topics))) <= COUNT
 
 
+def first_index(content, chunk):
+    """Give where the first message index behind a chunk's begin stands."""
+    index = content.index(b'\x07', chunk + 60)
+    while struct.unpack_from('<Q', content, index + 1)[0] != 6 + 16 * content[index + 11] // 16:
+        index = content.index(b'\x07', index + 1)
+    return index
+
+
+def test_an_index_that_ends_within_an_entry_costs_no_message(folder):
+    content = bytearray((folder / 'plain').read_bytes())
+    index = first_index(content, 0)
+    (entries,) = struct.unpack_from('<I', content, index + 11)
+    content[index + 11 : index + 15] = struct.pack('<I', entries + 13)
+    content[index + 15 + entries : index + 15 + entries] = bytes(13)
+    assert raw(damaged(folder, content))[0] == WHOLE
+
+
 def test_a_chunk_that_claims_to_be_shorter_than_its_head_is_no_chunk(folder):
     content = bytearray((folder / 'plain').read_bytes())
     chunk = next(m.start() for m in re.finditer(rb'\x06.{5}\0\0\0', content, re.DOTALL))
-    index = content.index(b'\x07', chunk + 60)  # some record that begins where it says it ends
-    while struct.unpack_from('<Q', content, index + 1)[0] != 6 + 16 * content[index + 11] // 16:
-        index = content.index(b'\x07', index + 1)
+    index = first_index(content, chunk)
     record = bytes(content[index : index + 9 + 6 + content[index + 11]])
     content[chunk + 1 : chunk + 9] = struct.pack('<Q', 22)
     content[chunk + 9 + 22 : chunk + 9 + 22 + len(record)] = record

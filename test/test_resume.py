@@ -151,7 +151,7 @@ def test_kills_at_any_moments_one_after_another_change_nothing(bag, whole, tmp_p
     out, rng = tmp_path / 'out', random.Random(0)
     kills = 0
     for _ in range(10):
-        process = start(bag, out, wait=False, seconds=0.05, resume=True)
+        process = start(bag, out, wait=False, seconds=0.2, resume=True)
         time.sleep(rng.uniform(0.05, 0.6))
         kills += process.kill()[0] == -signal.SIGKILL
         if out.exists():
