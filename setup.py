@@ -1,16 +1,18 @@
 """How colcon and pip install the package."""
 
 from glob import glob
+import xml.etree.ElementTree as ET
 
 from setuptools import find_packages, setup
 
 NAME = 'depth_deblur_ros'
+PACKAGE_XML = ET.parse('package.xml')  # where the version stands
 # ROS from wheels exists for x86_64 alone; elsewhere, and on robots, rclpy comes with ROS itself.
 ON_X86_LINUX = "; sys_platform == 'linux' and platform_machine == 'x86_64'"
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=PACKAGE_XML.findtext('version'),
     description='Deblurs RGB-D images and tells the camera motion during the exposure',
     license='Apache-2.0',
     maintainer='depth_deblur_ros maintainers',
