@@ -15,8 +15,9 @@ from pathlib import Path
 import sys
 from typing import NoReturn, TYPE_CHECKING
 
+from depth_deblur_ros import flags
 from depth_deblur_ros.core.data import InputError, Outcome
-from depth_deblur_ros.flags import Parser, solver_flags, solver_params, topic
+from depth_deblur_ros.flags import Parser
 from tqdm import tqdm
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code."""
     try:
         args = _parser().parse_args(argv)
-        if 'mode' in args:  # a command that solves
+        if 'params' in args:  # a command that solves
             from depth_deblur_ros.compiling import tell_of_compiling
 
             tell_of_compiling(lambda text: print(f'depth-deblur: {text}', file=sys.stderr))
@@ -63,6 +64,7 @@ def replay_main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog='depth-deblur', description='Deblur RGB-D images and tell the motion.')
+    parser.add_argument('--version', action='version', version=flags.installed_version())
     commands = parser.add_subparsers(metavar='COMMAND', required=True)
 
     def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> Parser:
@@ -93,7 +95,7 @@ def _image_flags(parser: Parser) -> None:
     parser.add_argument('depth', type=Path, help='depth image, 16 bit, registered to the colour')
     parser.add_argument('--camera', type=Path, required=True, help='camera.json')
     parser.add_argument('-o', '--out', type=Path, required=True, metavar='DIR', help='results')
-    solver_flags(parser)
+    flags.solver_flags(parser)
 
 
 def _image(args: argparse.Namespace) -> int:
@@ -104,7 +106,7 @@ def _image(args: argparse.Namespace) -> int:
     from depth_deblur_ros.page import run_page
     from depth_deblur_ros.results import motion_record
 
-    params = solver_params(args)
+    params = flags.solver_params(args)
     if args.energy and params.method != 'paper':
         raise InputError(f'--energy needs the method paper, got {params.method}')
     frame = read_frame(args.rgb, args.depth, args.camera)
@@ -136,7 +138,7 @@ def _sequence(args: argparse.Namespace) -> int:
     from depth_deblur_ros.core.solver import deblur
     from depth_deblur_ros.folders import read_frame, write_image, write_video
 
-    params = solver_params(args)
+    params = flags.solver_params(args)
     frame = read_frame(args.rgb, args.depth, args.camera)
     result = deblur(frame, params)
     views = sharp_sequence(result.image, result.depth, result.motion, frame.camera, args.frames)
@@ -156,13 +158,13 @@ def _bench_flags(parser: Parser) -> None:
     parser.add_argument(
         '--oracle', action='store_true', help='take the motion from truth/motion.json as known'
     )
-    solver_flags(parser)
+    flags.solver_flags(parser)
 
 
 def _bench(args: argparse.Namespace) -> int:
     from depth_deblur_ros import bench
 
-    params = solver_params(args)
+    params = flags.solver_params(args)
     cases = bench.find_cases(args.cases)
     solving = bench.solve_cases(cases, args.out, params, oracle=args.oracle)
     rows = list(tqdm(solving, total=len(cases), unit='case', disable=None))
@@ -201,7 +203,7 @@ def _replay_flags(parser: Parser) -> None:
     parser.add_argument('--estimates', type=Path, metavar='FILE', help='one line of JSON per pair')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='one picture per frame')
     parser.add_argument('--report', action='store_true', help='one page of the run: OUT.html')
-    _source_flags(parser)
+    flags.source_flags(parser)
     parser.add_argument('--exposure-s', type=float, metavar='S', help='exposure of every frame')
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='skip S seconds')
     parser.add_argument('--duration', type=float, metavar='S', help='stop after S seconds')
@@ -217,18 +219,7 @@ def _replay_flags(parser: Parser) -> None:
     where.add_argument(
         '--scheduler', metavar='ADDRESS', help='many bags: on a cluster of dask.distributed'
     )
-    solver_flags(parser)
-
-
-def _source_flags(parser: Parser) -> None:
-    parser.add_argument('--camera', type=Path, help='camera.json instead of the camera_info topic')
-    parser.add_argument(
-        '--topics',
-        nargs='+',
-        type=topic,
-        metavar='NAME=TOPIC',
-        help='for colour, depth, info, exposure (default: the usual names, else the only fit)',
-    )
+    flags.solver_flags(parser)
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -293,7 +284,7 @@ def _job_of(args: argparse.Namespace) -> Job:
     told = {f.name for f in fields(Job)} - {'bag', 'params', 'camera', 'topics'}
     return Job(
         bag=Path(args.bag[0]),
-        params=solver_params(args),
+        params=flags.solver_params(args),
         camera=read_camera(args.camera) if args.camera else None,
         topics=dict(args.topics or ()),
         **{name: getattr(args, name) for name in told},
@@ -305,7 +296,8 @@ def _report_flags(parser: Parser) -> None:
     parser.add_argument('out', type=Path, help='bag of the results')
     parser.add_argument('-o', '--page', type=Path, metavar='FILE', help='default: OUT.html')
     parser.add_argument('--estimates', type=Path, metavar='FILE', help='of replay: adds energies')
-    _source_flags(parser)
+    flags.source_flags(parser)
+    flags.rectified_flag(parser)
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -313,8 +305,14 @@ def _report(args: argparse.Namespace) -> int:
     from depth_deblur_ros.job import Job, page_of, write_page
 
     camera = read_camera(args.camera) if args.camera else None
-    topics = dict(args.topics or ())
-    job = Job(args.bag, args.out, camera=camera, topics=topics, estimates=args.estimates)
+    job = Job(
+        args.bag,
+        args.out,
+        params=flags.solver_params(args),
+        camera=camera,
+        topics=dict(args.topics or ()),
+        estimates=args.estimates,
+    )
     print(write_page(job, args.page or page_of(args.out)))
     return DONE
 

@@ -7,6 +7,8 @@ Whatever cannot work raises an InputError of one line.
 from __future__ import annotations
 
 import argparse
+from dataclasses import Field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 import re
 from typing import Any, NoReturn
@@ -35,6 +37,14 @@ _RosYaml.add_implicit_resolver(
 )
 
 
+def installed_version() -> str:
+    """Give the version, which stands in package.xml, as installing has noted it."""
+    try:
+        return version('depth_deblur_ros')
+    except PackageNotFoundError:
+        return 'not installed'
+
+
 def topic(text: str) -> tuple[str, str]:
     """Split NAME=TOPIC."""
     name, equals, topic = text.partition('=')
@@ -55,21 +65,42 @@ def solver_flags(parser: Parser) -> None:
     group = parser.add_argument_group('solver parameters')
     group.add_argument('--params', type=Path, metavar='FILE', help='YAML, as ROS takes it')
     for knob in knobs():
-        meta = knob.metadata
-        limits = 'TEXT'
-        if 'choices' in meta:
-            limits = '|'.join(meta['choices'])
-        elif isinstance(knob.default, bool):
-            limits = '|'.join(TRUTHS)
-        elif 'low' in meta:
-            limits = f'{meta["low"]}..{meta["high"]}'
-        group.add_argument(
-            '--' + knob.name.replace('_', '-'),
-            type=truth if isinstance(knob.default, bool) else type(knob.default),
-            default=argparse.SUPPRESS,
-            metavar=limits,
-            help=f'{meta["help"]} (default: {_shown(knob.default)})'.replace('%', '%%'),
-        )
+        _knob_flag(group, knob)
+
+
+def _knob_flag(group: argparse._ActionsContainer, knob: Field[Any]) -> None:
+    meta = knob.metadata
+    limits = 'TEXT'
+    if 'choices' in meta:
+        limits = '|'.join(meta['choices'])
+    elif isinstance(knob.default, bool):
+        limits = '|'.join(TRUTHS)
+    elif 'low' in meta:
+        limits = f'{meta["low"]}..{meta["high"]}'
+    group.add_argument(
+        '--' + knob.name.replace('_', '-'),
+        type=truth if isinstance(knob.default, bool) else type(knob.default),
+        default=argparse.SUPPRESS,
+        metavar=limits,
+        help=f'{meta["help"]} (default: {_shown(knob.default)})'.replace('%', '%%'),
+    )
+
+
+def source_flags(parser: Parser) -> None:
+    """Add the flags that say which topics of a bag are meant."""
+    parser.add_argument('--camera', type=Path, help='camera.json instead of the camera_info topic')
+    parser.add_argument(
+        '--topics',
+        nargs='+',
+        type=topic,
+        metavar='NAME=TOPIC',
+        help='for colour, depth, info, exposure (default: the usual names, else the only fit)',
+    )
+
+
+def rectified_flag(parser: Parser) -> None:
+    """Add the one solver parameter that counts where a solved bag is only read."""
+    _knob_flag(parser, next(knob for knob in knobs() if knob.name == 'rectified'))
 
 
 def _shown(value: Any) -> str:
@@ -78,7 +109,8 @@ def _shown(value: Any) -> str:
 
 def solver_params(args: argparse.Namespace) -> SolverParams:
     """Give the parameters of the line, else of its file, else the defaults."""
-    base = params_from_mapping(read_params(args.params) if args.params else {})
+    file = getattr(args, 'params', None)
+    base = params_from_mapping(read_params(file) if file else {})
     given = {knob.name: getattr(args, knob.name) for knob in knobs() if hasattr(args, knob.name)}
     return params_from_mapping(given, base)
 

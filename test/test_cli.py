@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import cv2
-from depth_deblur_ros import cli, flags
+from depth_deblur_ros import cli, compiling, flags
 from depth_deblur_ros.core.params import knobs, SolverParams
 import numpy as np
 import pytest
@@ -76,6 +76,21 @@ def test_the_module_runs_as_a_program():
     assert done.returncode == 2
     assert 'arguments are required: --camera' in done.stderr
     assert done.stderr.count('\n') == 1
+
+
+def test_the_version_is_that_of_package_xml(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(['--version'])
+    package = Path(__file__).resolve().parents[1] / 'package.xml'
+    assert stop.value.code == 0
+    assert f'<version>{capsys.readouterr().out.strip()}</version>' in package.read_text()
+
+
+def test_what_solves_says_when_it_compiles(files, monkeypatch, capsys):
+    monkeypatch.setattr(compiling, 'tell_of_compiling', lambda say: say('compiling'))
+    (files / 'rgb.png').unlink()
+    cli.main(image_command(files))
+    assert capsys.readouterr().err.startswith('depth-deblur: compiling')
 
 
 def test_a_flag_for_every_parameter():

@@ -152,6 +152,12 @@ def test_what_a_distorting_lens_took_is_shown_undistorted(tmp_path, monkeypatch)
     run = review(bag, tmp_path / 'out', rectified=False)
     first = run.shots[0].pictures
     assert first['blurred'] == first['sharp']  # as the solver gives it back
+    command = ['report', str(bag), str(tmp_path / 'out')]
+    pages = []
+    for more in ([], ['--rectified', 'false']):
+        cli.main(command + more)
+        pages.append((tmp_path / 'out.html').read_text())
+    assert ['<span>unchanged</span>' in page for page in pages] == [False, True]
 
 
 def test_colour_frames_without_a_pair_are_counted(tmp_path):
