@@ -79,7 +79,7 @@ def test_the_node_starts_as_ros2_run_starts_it(clone, colcon, tmp_path, monkeypa
     line = f'. {workspace}/install/setup.bash && exec {prefix}/lib/{NAME}/deblur_node {arguments}'
     peer, node = ros_parts.Peer(), ros_parts.Process(['bash', '-c', line], tmp_path / 'log')
     try:
-        peer.until(lambda: peer.status()[0].startswith('nothing on /rgb/image_rect_color'), 60)
+        peer.until(lambda: peer.status()[0].startswith('nothing on /rgb/image_rect_color'), 200)
         assert peer.status()[1]['mode'] == 'full'
         assert node.stop() == 0, node.text()
     finally:
