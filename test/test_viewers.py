@@ -55,6 +55,35 @@ def topics_of(panel):
     return {t for t in found if t} | {p['value'].split('.')[0] for p in panel.get('paths', ())}
 
 
+# The settings that the panels of Foxglove (and Lichtblick) know, as their sources name them.
+KNOWN = {
+    'Image': {'foxglovePanelTitle', 'imageMode'},
+    'Plot': {'foxglovePanelTitle', 'paths', 'isSynced', 'xAxisVal', 'sidebarDimension'}
+    | {'showLegend', 'legendDisplay', 'showPlotValuesInLegend'}
+    | {'showXAxisLabels', 'showYAxisLabels'},
+    'RawMessages': {'topicPath', 'diffEnabled', 'diffMethod', 'diffTopicPath'}
+    | {'showFullMessageForDiff'},
+    'DiagnosticSummary': {'topicToRender', 'minLevel', 'hardwareIdFilter', 'pinnedIds'}
+    | {'sortByLevel'},
+    'DiagnosticStatusPanel': {'topicToRender', 'selectedHardwareId', 'selectedName'},
+}
+
+
+@pytest.mark.parametrize('name', PANELS)
+def test_each_panel_has_settings_that_its_viewer_knows(name):
+    kind, panel = name.split('!')[0], PANELS[name]
+    assert set(panel) <= KNOWN[kind]
+    for path in panel.get('paths', ()):
+        assert set(path) == {'value', 'label', 'enabled', 'timestampMethod'}
+        assert path['timestampMethod'] in ('headerStamp', 'receiveTime')
+
+
+def test_the_status_that_is_picked_is_the_one_that_the_node_sends():
+    source = (CONFIG.parent / 'depth_deblur_ros/node.py').read_text()
+    node, status = PANELS['DiagnosticStatusPanel!node']['selectedName'].split(': ')
+    assert f"NAME = '{node}'" in source and f"f'{{self.get_name()}}: {status}'" in source
+
+
 def test_every_panel_has_its_place_and_its_settings():
     placed = leaves(LAYOUT['layout'])
     assert sorted(placed) == sorted(PANELS)
