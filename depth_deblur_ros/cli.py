@@ -117,7 +117,7 @@ def _image(args: argparse.Namespace) -> int:
         write_text(args.energy, energy_chart(result.energies))
     if args.report:
         note = note_of(frame.stamp_ns, frame.exposure, result)
-        run = Run(args.rgb.parent.resolve().name, [note], [shot_of(frame, result)])
+        run = Run(args.rgb.parent.resolve().name, [note], [shot_of(frame, result, params.prior)])
         write_text(args.report, run_page(run))
     print(
         f'{result.outcome.value}: blur {result.blur_px:.1f} px, quality {result.quality:.2f}, '

@@ -115,7 +115,7 @@ def write_page(job: Job, page: Path, lost: Mapping[str, int] | None = None) -> s
         topics=job.topics,
         estimates=job.estimates,
         lost=lost,
-        rectified=job.params.rectified,
+        params=job.params,
     )
     write_text(page, run_page(run))
     return f'{page}: {len(run.notes)} frames, pictures of {len(run.shots)}'

@@ -7,11 +7,14 @@ from dataclasses import dataclass, field
 
 import cv2
 from depth_deblur_ros.core.data import DeblurResult, EnergyStep, Outcome, RgbdFrame, Vector
+from depth_deblur_ros.core.params import SolverParams
+from depth_deblur_ros.misfit import energies_of
 from depth_deblur_ros.report import depth_limits, draw_depth, draw_flow, draw_image, Picture
 import numpy as np
 
 SHOTS = 8  # frames of which a run keeps pictures
 WEBP_QUALITY = 82
+PRIOR = SolverParams().prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +48,17 @@ class Note:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """The pictures of one frame by name, as WebP, and the depths [m] that its colours span."""
+    """
+    The pictures of one frame by name, as WebP, and the depths [m] that its colours span.
+
+    gains are the energies before and after the image step, as energies_of gives them.
+    """
 
     stamp_ns: int
     pictures: Mapping[str, bytes]
     size: tuple[int, int]
     limits: tuple[float, float]
+    gains: tuple[EnergyStep, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +94,8 @@ def note_of(stamp_ns: int, exposure: float | None, result: DeblurResult) -> Note
     )
 
 
-def shot_of(frame: RgbdFrame, result: DeblurResult) -> Shot:
-    """Draw the pictures of a frame."""
+def shot_of(frame: RgbdFrame, result: DeblurResult, prior: float = PRIOR) -> Shot:
+    """Draw the pictures of a frame, and weigh it; prior as the solver had it."""
     limits = depth_limits(result)
     pictures = {
         'blurred': draw_image(frame.image),
@@ -97,7 +105,8 @@ def shot_of(frame: RgbdFrame, result: DeblurResult) -> Shot:
     }
     height, width = pictures['blurred'].shape[:2]
     encoded = {name: _webp(picture) for name, picture in pictures.items()}
-    return Shot(frame.stamp_ns, encoded, (width, height), limits)
+    gains = energies_of(frame, result, prior)
+    return Shot(frame.stamp_ns, encoded, (width, height), limits, gains)
 
 
 def spread_evenly(count: int, most: int = SHOTS) -> list[int]:

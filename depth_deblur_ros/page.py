@@ -20,6 +20,11 @@ import numpy as np
 
 DEVIATIONS = 2.0  # standard deviations that the band spans on each side
 AXES = ('x, right', 'y, down', 'z, ahead')
+ENERGY = (
+    'What the image step lowers, (7) of docs/method.md: how far the image, blurred by the motion, '
+    'is from what was taken (a mean square, weighed), and how unlike a sharp image it is (the '
+    'prior). What is left of the misfit is noise, and what the motion does not explain.'
+)
 TURN, SHIFT = ('Turning about ', 'rad/s'), ('Moving along ', 'm/s')
 
 
@@ -202,14 +207,38 @@ def _times(run: Run) -> Iterator[str]:
 
 
 def _energies(run: Run) -> Iterator[str]:
-    """Draw the energies of the frames that are shown, where the method has any."""
-    shown = {shot.stamp_ns for shot in run.shots}
-    told = [(k, n) for k, n in enumerate(run.notes) if n.energies and n.stamp_ns in shown]
-    if told:
+    """Tell the energies of the frames that are shown, and draw those of the paper's turns."""
+    numbers = {note.stamp_ns: k for k, note in enumerate(run.notes)}
+    shown = [(numbers[shot.stamp_ns], shot) for shot in run.shots]
+    turns = [(k, run.notes[k].energies) for k, _ in shown if run.notes[k].energies]
+    if turns:
         yield '<section id="energy"><h2>Energy</h2>'
-        for k, note in told:
-            yield f'<h3>Frame {k + 1}</h3>{_charts(energy_panels(note.energies))}'
+        for k, energies in turns:
+            yield f'<h3>Frame {k + 1}</h3>{_charts(energy_panels(energies))}'
         yield '</section>'
+    elif any(shot.gains for _, shot in shown):
+        yield f'<section id="energy"><h2>Energy</h2>{_charts([*_gains(run)])}'
+        yield f'<p>{ENERGY}</p></section>'
+
+
+def _gains(run: Run) -> Iterator[Panel]:
+    """Draw the energy before and after the image step, at each of its sizes."""
+    shots = [shot for shot in run.shots if shot.gains]
+    first = run.notes[0].stamp_ns
+    x = np.array([(shot.stamp_ns - first) / 1e9 for shot in shots])
+    for level, title in enumerate(('At half the size', 'At full size')):
+        told = [{e.step: e.terms for e in shot.gains if e.level == level} for shot in shots]
+        if not all(told):
+            continue
+        before, after = (
+            np.array([sum(t[step].values()) for t in told]) for step in ('before', 'after')
+        )
+        curves = (
+            Curve('image as taken', x, before, 1, 'points'),
+            Curve('sharp image', x, after, 2, 'points'),
+            Curve('of it the prior', x, np.array([t['after']['prior'] for t in told]), 4, 'rings'),
+        )
+        yield Panel(title, curves, 'time [s]', 'grey levels² per sample', limits=(0.0, 1.0))
 
 
 def _losses(run: Run) -> Iterator[str]:

@@ -36,11 +36,15 @@ img{display:block;width:100%;height:auto;border-radius:6px}
 .wipe .sharp{position:absolute;inset:0;clip-path:inset(0 0 0 var(--at))}
 .wipe::after{content:'';position:absolute;top:0;bottom:0;left:calc(var(--at) - 1px);width:2px;
 background:#fff;box-shadow:0 0 4px #000;pointer-events:none}
+.wipe::before{content:'\\2039\\2009\\203A';position:absolute;top:calc(50% - 15px);z-index:1;
+left:calc(var(--at) - 15px);width:30px;height:30px;border-radius:50%;background:#fff;color:#1f2328;
+font:600 20px/26px system-ui,sans-serif;text-align:center;box-shadow:0 0 4px #000;
+pointer-events:none}
 .wipe input{position:absolute;inset:0;width:100%;height:100%;margin:0;opacity:0;
 cursor:ew-resize}.wipe:has(input:focus-visible){outline:2px solid var(--sharp);
 outline-offset:2px;border-radius:6px}
 .facts{margin:6px 0 0;font-size:14px;font-variant-numeric:tabular-nums}
-.charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(340px,100%),1fr));gap:14px}
+.charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(340px,100%),1fr));gap:14px}
 .chart{display:block;width:100%;height:auto}
 table{border-collapse:collapse}th,td{text-align:left;padding:4px 18px 4px 0;
 border-bottom:1px solid var(--line)}th{color:var(--faint);font-weight:500}

@@ -23,6 +23,7 @@ from depth_deblur_ros.core.data import (
     Outcome,
     Vector,
 )
+from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.frames import frame_from_pair, Given
 from depth_deblur_ros.messages import depth_from_msg, image_from_msg, stamp_ns
 from depth_deblur_ros.notes import Note, Run, shot_of, spread_evenly
@@ -34,6 +35,7 @@ from scipy.spatial.transform import Rotation, Slerp
 TWIST_TOPIC, POSE_TOPIC = '/ground_truth/motion', '/ground_truth/pose'
 SHORTEST_BASE = 0.02  # s between the two poses of a velocity
 WIDEST_GAP = 0.2  # s between recorded poses, over which nothing is said
+DEFAULTS = SolverParams()
 ERROR = 2  # level of a DiagnosticStatus: the solver did not take the frame
 
 
@@ -46,12 +48,12 @@ def review(
     estimates: Path | None = None,
     lost: Mapping[str, int] | None = None,
     slop_s: float = 0.02,
-    rectified: bool = True,
+    params: SolverParams = DEFAULTS,
 ) -> Run:
     """
     Read what a replay of `bag` left in `out`.
 
-    camera, topics and rectified as replay takes them; estimates, its file of that name, adds the
+    camera, topics and params as replay took them; estimates, its file of that name, adds the
     energies; lost counts the colour frames without a pair, as replay does (default: those between
     the first result and the last).
     """
@@ -69,9 +71,10 @@ def review(
         shots = []
         for pair in pairs.pairs(min(notes), max(notes) + round(slop_s * 1e9) + 1):
             if pair.log_ns in images:
-                frame = frame_from_pair(pair, Given(camera, rectified=rectified))
+                frame = frame_from_pair(pair, Given(camera, rectified=params.rectified))
                 image, depth = images.pop(pair.log_ns)
-                shots.append(shot_of(frame, _result(chosen[pair.log_ns], image, depth)))
+                result = _result(chosen[pair.log_ns], image, depth)
+                shots.append(shot_of(frame, result, params.prior))
         truth = _true_twists(source, ordered)
     return Run(
         Path(bag).name, ordered, shots, truth, dict(pairs.dropped if lost is None else lost)

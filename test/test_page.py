@@ -143,6 +143,14 @@ def test_a_single_picture_has_no_time_to_draw_over():
     assert ids == ['frames', 'frame-0', 'energy', 'losses']
 
 
+def test_the_energy_of_each_size_is_drawn():
+    run = run_of([Outcome.SOLVED] * 2)
+    assert all([e.level for e in shot.gains] == [0, 0, 1, 1] for shot in run.shots)
+    page = run_page(replace(run, notes=[replace(note, energies=()) for note in run.notes]))
+    text = ' '.join(Elements(page).words)
+    assert 'At half the size' in text and 'At full size' in text and 'image as taken' in text
+
+
 def test_what_was_left_as_it_was_is_not_called_sharp():
     run = run_of([Outcome.SOLVED])
     same = {**run.shots[0].pictures, 'sharp': run.shots[0].pictures['blurred']}

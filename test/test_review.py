@@ -149,7 +149,7 @@ def test_what_a_distorting_lens_took_is_shown_undistorted(tmp_path, monkeypatch)
     monkeypatch.setitem(globals(), 'CAMERA', lens)
     bag, params = write_bag(tmp_path / 'in'), SolverParams(rectified=False)
     replay(bag, tmp_path / 'out', params=params, solve=filled)
-    run = review(bag, tmp_path / 'out', rectified=False)
+    run = review(bag, tmp_path / 'out', params=params)
     first = run.shots[0].pictures
     assert first['blurred'] == first['sharp']  # as the solver gives it back
     command = ['report', str(bag), str(tmp_path / 'out')]
