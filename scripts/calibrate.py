@@ -1,18 +1,23 @@
 """
 Ask whether the covariance of the motion is right, on rendered frames with known motion.
 
-usage: python scripts/calibrate.py [--frames N] [--mode MODE] [--plot FILE.svg]
+usage: python scripts/calibrate.py [--frames N] [--first N] [--modes MODE ...] [--workers N]
+       [--plot FILE.svg] [--worst FOLDER]
 
 Rooms, paths and blurs (2 to 40 px) are drawn anew for each frame, from numbers that nothing else
-in the project uses. Prints, for each axis of the motion, how many of the true motions lie within
-one and three standard deviations of what was solved, but for the sign; the plot tells it for all
-numbers of deviations.
+in the project uses; the solver's constants were set on some of the first 300, so --first 300 asks
+frames that are new to it. Prints, for each mode and axis of the motion, how many of the true
+motions lie within one and three standard deviations of what was solved, but for the sign; the
+plot tells it for all numbers of deviations. --worst draws the five frames with the worst flow.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from depth_deblur_ros.charts import chart, Curve, Panel
@@ -26,6 +31,8 @@ from depth_deblur_ros.core.data import (
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.params import MODES, SolverParams
 from depth_deblur_ros.core.solver import deblur
+from depth_deblur_ros.folders import write_image
+from draw_worst import both_ways
 import numpy as np
 import numpy.typing as npt
 from scene import make_scene
@@ -41,6 +48,7 @@ BLURS = (2.0, 40.0)  # px, mean over the picture; even in the logarithm
 EXPOSURES = (0.008, 0.033)  # s
 FASTEST = 6.0  # times the speed of an ordinary hand
 LEAST_VIEWS = 17
+WILD_PX, WILD_SHARE, WORST = 2.0, 0.25, 5
 Array = npt.NDArray[np.float64]
 
 
@@ -73,6 +81,17 @@ def take(number: int) -> Shot:
     return Shot(RgbdFrame(colour, depth, CAMERA), motion, length)
 
 
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What became of a shot: error (6,) in standard deviations and of the flow [px] if solved."""
+
+    number: int
+    blur: float
+    outcome: Outcome
+    error: Array | None = None
+    miss: float = 0.0
+
+
 def deviations(shot: Shot, result: DeblurResult) -> tuple[Array, float]:
     """Give the error of each axis (6,) in standard deviations, and of the flow [px]."""
     found, true, depth = result.motion, shot.motion.vector, result.depth
@@ -83,46 +102,88 @@ def deviations(shot: Shot, result: DeblurResult) -> tuple[Array, float]:
     return np.asarray((found.vector - sign * true) / spread), min(misses)
 
 
-def plotted(errors: Array) -> str:
+def asked(number: int, modes: Sequence[str]) -> list[Answer]:
+    """Render a frame and solve it in each mode."""
+    shot, answers = take(number), []
+    for mode in modes:
+        # The image does not count here.
+        result = deblur(shot.frame, SolverParams(mode=mode, threads=1, reweightings=1, cg_steps=1))
+        answer = Answer(number, shot.blur, result.outcome)
+        if result.outcome is Outcome.SOLVED:
+            error, miss = deviations(shot, result)
+            answer = replace(answer, error=error, miss=miss)
+        answers.append(answer)
+    return answers
+
+
+def printed(mode: str, answers: Sequence[Answer]) -> None:
+    """Print the table of one mode."""
+    solved = [answer for answer in answers if answer.error is not None]
+    counts = [f'{sum(a.outcome is o for a in answers)} {o}' for o in Outcome]
+    misses = [answer.miss for answer in solved]
+    print(f'mode {mode}: {", ".join(counts)}')
+    print(f'flow error {np.mean(misses):.2f} px, median {np.median(misses):.2f} px')
+    wild = [a for a in solved if a.miss > max(WILD_PX, WILD_SHARE * a.blur)]
+    told = ', '.join(f'{a.number} ({a.miss:.1f} of {a.blur:.1f} px)' for a in wild)
+    print(f'{len(wild)} wrong by more than {WILD_PX} px and {WILD_SHARE:.0%}: {told}')
+    far = np.abs([answer.error for answer in solved])
+    for k, name in enumerate(AXES):
+        within = [100 * (far[:, k] <= bound).mean() for bound in (1, 3)]
+        print(f'{name:8s} within 1 sigma {within[0]:5.1f} %, within 3 sigma {within[1]:5.1f} %')
+
+
+def plotted(errors: dict[str, Array]) -> str:
     """Draw the share of errors (n, 6) within so many deviations, as it is and as it should be."""
     at = np.linspace(0, 4, 81)
     panels = []
     for k, name in enumerate(AXES):
-        within = (np.abs(errors[:, k, None]) <= at).mean(0)
-        curves = (
-            Curve('errors', at, within),
-            Curve('normal distribution', at, 2 * norm.cdf(at) - 1, colour=4),
-        )
-        panels.append(Panel(name, curves, 'standard deviations', 'share'))
-    title = f'share of {len(errors)} frames whose error lies within so many standard deviations'
+        curves = [
+            Curve(f'mode {mode}', at, (np.abs(own[:, k, None]) <= at).mean(0), colour=2 * m)
+            for m, (mode, own) in enumerate(errors.items())
+        ]
+        curves.append(Curve('normal distribution', at, 2 * norm.cdf(at) - 1, colour=4))
+        panels.append(Panel(name, tuple(curves), 'standard deviations', 'share'))
+    count = max(len(own) for own in errors.values())
+    title = f'share of {count} frames whose error lies within so many standard deviations'
     return chart(panels, 3, title)
 
 
+def draw_worst(answers: Sequence[Answer], folder: Path) -> None:
+    """Draw the frames whose flow is most wrong, and with their true motion."""
+    worst = sorted(answers, key=lambda answer: answer.miss, reverse=True)[:WORST]
+    for answer in worst:
+        shot = take(answer.number)
+        write_image(folder / f'{answer.number}.jpg', both_ways(shot.frame, shot.motion))
+
+
 def main() -> None:
-    """Render, solve, and print the table."""
+    """Render, solve, and print the tables."""
     parser = argparse.ArgumentParser(description='Ask whether the covariance is right.')
     parser.add_argument('--frames', type=int, default=FRAMES)
-    parser.add_argument('--mode', choices=MODES, default='full')
+    parser.add_argument('--first', type=int, default=0)
+    parser.add_argument('--modes', nargs='+', choices=MODES, default=['full', 'motion'])
+    parser.add_argument('--workers', type=int, default=1)
     parser.add_argument('--plot', type=Path)
+    parser.add_argument('--worst', type=Path)
     args = parser.parse_args()
-    params, errors, misses = SolverParams(mode=args.mode), [], []
-    outcomes = dict.fromkeys(Outcome, 0)
-    for number in range(args.frames):
-        shot = take(number)
-        result = deblur(shot.frame, params)
-        outcomes[result.outcome] += 1
-        if result.outcome is Outcome.SOLVED:
-            error, miss = deviations(shot, result)
-            errors.append(error)
-            misses.append(miss)
-    print(', '.join(f'{count} {outcome}' for outcome, count in outcomes.items()))
-    print(f'flow error {np.mean(misses):.2f} px, median {np.median(misses):.2f} px')
-    far = np.abs(errors)
-    for k, name in enumerate(AXES):
-        within = [100 * (far[:, k] <= bound).mean() for bound in (1, 3)]
-        print(f'{name:8s} within 1 sigma {within[0]:5.1f} %, within 3 sigma {within[1]:5.1f} %')
+    numbers = range(args.first, args.first + args.frames)
+    work = partial(asked, modes=args.modes)
+    if args.workers == 1:
+        rows = list(map(work, numbers))
+    else:
+        with ProcessPoolExecutor(args.workers) as pool:
+            rows = list(pool.map(work, numbers))
+    columns = dict(zip(args.modes, zip(*rows, strict=True), strict=True))
+    for mode, answers in columns.items():
+        printed(mode, answers)
     if args.plot:
-        args.plot.write_text(plotted(np.array(errors)))
+        errors = {
+            mode: np.array([a.error for a in answers if a.error is not None])
+            for mode, answers in columns.items()
+        }
+        args.plot.write_text(plotted(errors))
+    if args.worst:
+        draw_worst(columns[args.modes[0]], args.worst)
 
 
 if __name__ == '__main__':

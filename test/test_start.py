@@ -122,3 +122,44 @@ def test_the_covariance_is_symmetric_positive_and_covers_the_error():
         misses = [np.linalg.solve(AXES, motion.vector - s * true.vector) for s in (1, -1)]
         far.append(min(m @ np.linalg.solve(covariance, m) for m in misses))
     assert np.median(far) < 12.6  # nineteen in twenty of chi squared, 6 degrees of freedom
+
+
+class Said:
+    """A scale whose score of any motion is given."""
+
+    def __init__(self, factor, score):
+        self.factor, self.evidence = factor, score
+
+
+@pytest.fixture
+def said(monkeypatch):
+    monkeypatch.setattr(start, 'scores', lambda qs, score: np.full(len(qs), score))
+    monkeypatch.setattr(
+        start, 'common_score', lambda qs, scales: np.full(len(qs), sum(s.evidence for s in scales))
+    )
+    return lambda *scores: [Said(2**k, score) for k, score in enumerate(scores)]
+
+
+def test_a_single_scale_must_say_more_of_a_blur_below_16_px(said):
+    q = np.zeros(6)
+    assert start._trusted(q, 20.0, said(-0.16), 1.0)
+    assert not start._trusted(q, 12.0, said(-0.16), 1.0)
+    assert start._trusted(q, 12.0, said(-0.18), 1.0)
+    assert start._trusted(q, 12.0, said(-0.16, -0.1), 1.0)  # two scales do not need it
+
+
+def test_a_short_blur_must_show_close_up_and_from_5_px_on_at_full_scale_too(said):
+    q = np.zeros(6)
+    assert start._short_trusted(q, 3.0, said(-0.05, -0.25))
+    assert not start._short_trusted(q, 7.0, said(-0.13, -0.13))
+    assert start._short_trusted(q, 7.0, said(-0.2, -0.13))
+    assert not start._short_trusted(q, 4.0, said(-0.25, -0.06))  # all said by one
+
+
+@pytest.mark.parametrize('length', [2.5, 3, 4])
+def test_a_short_blur_is_as_long_as_it_is(length):
+    found = []
+    for k in range(4):
+        motion = blind_start(swept(texture(k), length, 0.8 * k, 0.005), DEPTH, CAMERA).motion
+        found.append(np.linalg.norm(flow(motion.vector, DEPTH, CAMERA), axis=-1).mean())
+    assert np.mean(found) == pytest.approx(length, rel=0.06)

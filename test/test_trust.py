@@ -1,7 +1,13 @@
 """Whether there is blur at all, and how much a motion is worth."""
 
 import cv2
-from depth_deblur_ros.core.trust import covariance_from_curvature, sharpness
+from depth_deblur_ros.core.data import Motion
+from depth_deblur_ros.core.trust import (
+    calibrated,
+    covariance_from_curvature,
+    LEAST_ERROR,
+    sharpness,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -60,3 +66,15 @@ def test_any_curvature_gives_a_covariance(seed, size):
 def test_a_sharp_optimum_is_worth_its_curvature():
     covariance = covariance_from_curvature(np.diag([4.0, 1, 1, 1, 1, 0]), 100.0, PRIOR)
     np.testing.assert_allclose(np.diag(covariance)[[0, 1, 5]], [1 / 400, 1 / 100, 1600], rtol=1e-4)
+
+
+def test_a_calibrated_covariance_is_a_share_of_the_old_and_the_least_error():
+    axes = np.diag([1.0, 2, 3, 4, 5, 6])
+    motion = Motion.from_vector(np.arange(6.0), np.eye(6))
+    found = calibrated(motion, axes, 0.25)
+    np.testing.assert_array_equal(found.vector, motion.vector)
+    expected = np.diag(0.25 + np.square(np.diag(axes) * LEAST_ERROR))
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-12)
+    sure = calibrated(Motion.from_vector(motion.vector), axes, 0.25)
+    deviations = np.sqrt(np.diag(sure.covariance)) / np.diag(axes)
+    np.testing.assert_allclose(deviations, LEAST_ERROR)

@@ -41,7 +41,6 @@ SOFTEST, DISSENT = (
     10.0,
     10.0,
 )  # what the likelihood is divided by: at least; per chi^2 of the parts
-CALIBRATED = 0.55  # of the covariance, by scripts/calibrate.py
 BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 
 
@@ -81,7 +80,7 @@ def _moved(
             break
         last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
-    return Motion.from_vector(p, CALIBRATED * np.linalg.inv(bend / soft + certainty))
+    return Motion.from_vector(p, np.linalg.inv(bend / soft + certainty))
 
 
 def _slope(part: Part, p: Vector) -> Vector:

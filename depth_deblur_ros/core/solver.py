@@ -34,6 +34,7 @@ from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.light import light_from_stored, stored_from_light
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
+from depth_deblur_ros.core.trust import calibrated, OF_LIKELIHOOD, OF_SPECTRA
 import numba
 import numpy as np
 
@@ -60,10 +61,18 @@ def deblur(
             result = _finish(frame, depth, found, params, began)
             return replace(result, energies=energies)
         found = blind_start(_grey(frame.image), depth, frame.camera, start)
-        if params.mode == 'full' and found.outcome is Outcome.SOLVED:
-            light = _grey(light_from_stored(frame.image, frame.camera.transfer))
-            found = replace(found, motion=refine(light, depth, frame.camera, found.motion))
+        if found.outcome is Outcome.SOLVED:
+            found = replace(found, motion=_settled(frame, depth, found, params))
         return _finish(frame, depth, found, params, began)
+
+
+def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, params: SolverParams) -> Motion:
+    """Refine the motion in mode full; in each mode its covariance is as large as errors are."""
+    if params.mode != 'full':
+        return calibrated(found.motion, found.axes, OF_SPECTRA)
+    light = _grey(light_from_stored(frame.image, frame.camera.transfer))
+    motion = refine(light, depth, frame.camera, found.motion)
+    return calibrated(motion, found.axes, OF_LIKELIHOOD)
 
 
 def restore_known(

@@ -10,12 +10,14 @@ Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes); length = mean
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Outcome, Vector
 from depth_deblur_ros.core.evidence import motion_axes, scores, Spectra
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.search import (
+    CLOSE,
     close_up,
     common_score,
     find,
@@ -33,8 +35,12 @@ SHORT = 8.0  # px; up to here only the full scale sees bands at all
 SHORT_TRUST = 0.11  # least -S at full scale of a short blur
 CLOSE_BELOW = 9.0  # px; shorter blurs are looked at close up
 CLOSE_TRUST = 0.25  # least common -S at full scale and close up
+CLOSE_SHARE = 0.12  # least -S close up by itself
+PLAIN = 5.0  # px; longer blurs show at full scale as well
+CLOSE_BIAS = 1.0  # px; close up, blurs seem longer: the root of both squares
 LONG_TRUST = 0.2  # least common -S of a long blur
-ALONE_TRUST = 0.14  # where the full scale is the only one
+# Where the full scale is the only one; shorter blurs leave deeper bands than long ones.
+ALONE_TRUST, ALONE_SHORT, ALONE_SHORT_TRUST = 0.14, 16.0, 0.175
 DOUBT = 1.3  # times that where the picture looks sharp
 CLEARLY_SHARP, RATHER_SHARP = (
     1.15,
@@ -54,11 +60,12 @@ BEND = 1.0  # px, step of the second differences
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The first motion p (6,) (zero unless solved), what it is worth, and its covariance."""
+    """The first motion (zero unless solved) and its covariance, what it is worth, and axes G."""
 
     motion: Motion
     outcome: Outcome
     quality: float
+    axes: Vector = field(default_factory=lambda: np.eye(6))
 
 
 def blind_start(
@@ -93,13 +100,17 @@ def blind_start(
         closer, both = find_short(scales[0], close, q if trusted else None)
         if _short_trusted(closer, length(closer), both):
             q, scales, trusted = closer, both, True
+        elif len(scales) == 1:  # nobody has confirmed it
+            trusted = False
     if not trusted:
         return _nothing(Outcome.SHARP if edges > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     covariance = _covariance(q, scales, axes)
     if len(scales) == 1 and quality < LONELY:
         covariance = LONELY_SPREAD * covariance
-    return Start(Motion.from_vector(axes @ q, covariance), Outcome.SOLVED, quality)
+    if scales[-1].factor == CLOSE:
+        q = q * math.sqrt(1 - (CLOSE_BIAS / length(q)) ** 2)
+    return Start(Motion.from_vector(axes @ q, covariance), Outcome.SOLVED, quality, axes)
 
 
 def _found(
@@ -125,13 +136,17 @@ def _trusted(q: Vector, length: float, scales: list[Scale], edges: float) -> boo
     if length < SHORT:
         return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
     sharp = edges > (EDGED if length > LONG else RATHER_SHARP)
-    needed = (LONG_TRUST if len(scales) > 1 else ALONE_TRUST) * (DOUBT if sharp else 1)
+    alone = ALONE_TRUST if length > ALONE_SHORT else ALONE_SHORT_TRUST
+    needed = (LONG_TRUST if len(scales) > 1 else alone) * (DOUBT if sharp else 1)
     return bool(common_score(q[None], scales)[0] < -needed)
 
 
 def _short_trusted(q: Vector, length: float, both: list[Scale]) -> bool:
     """Tell whether a blur of this length [px] is seen at full scale and close up together."""
-    return SHORTEST <= length < CLOSE_BELOW and bool(common_score(q[None], both)[0] < -CLOSE_TRUST)
+    whole, close = (float(scores(q[None], scale.evidence)[0]) for scale in both)
+    seen = close < -CLOSE_SHARE and (length < PLAIN or whole < -ALONE_TRUST)
+    enough = bool(common_score(q[None], both)[0] < -CLOSE_TRUST)
+    return SHORTEST <= length < CLOSE_BELOW and seen and enough
 
 
 def _nothing(outcome: Outcome, axes: Vector) -> Start:

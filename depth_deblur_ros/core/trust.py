@@ -12,13 +12,17 @@ from __future__ import annotations
 import math
 
 import cv2
-from depth_deblur_ros.core.data import FloatImage, Vector
+from depth_deblur_ros.core.data import FloatImage, Motion, Vector
 import numpy as np
 import numpy.typing as npt
 
 DIRECTIONS = 8
 FURTHER = 3.0  # px of further blur
 ENOUGH = 15_000  # pixels or more that are looked at; the ratio is then good to 0.002
+# By scripts/calibrate.py: shares of the covariances that the spectra and the likelihood give, and
+# what no picture tells better of q: two shifts, roll, zoom, two parallaxes [px].
+OF_SPECTRA, OF_LIKELIHOOD = 0.15, 0.36
+LEAST_ERROR = (0.1, 0.1, 0.18, 0.05, 0.03, 0.03)
 
 
 def sharpness(grey: FloatImage) -> tuple[float, float]:
@@ -72,3 +76,9 @@ def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 0) + 1 / prior_px**2
     return np.asarray(vectors / values @ vectors.T)
+
+
+def calibrated(motion: Motion, axes: Vector, share: float) -> Motion:
+    """Give the motion with a covariance as large as its errors are; axes G, share of the old."""
+    least = axes @ np.diag(np.square(LEAST_ERROR)) @ axes.T
+    return Motion.from_vector(motion.vector, share * motion.covariance + least)
