@@ -1,8 +1,7 @@
 """
 One mcap file, read without trust in its index, so that a damaged one gives what is left.
 
-The blocks of the data section are listed first, without reading what is in them. Chunks, messages
-or the file may be compressed.
+Its blocks are listed first, unread. Chunks, messages or the whole file may be compressed.
 """
 
 from __future__ import annotations
@@ -224,9 +223,8 @@ class McapFile:
 
     def _index(self, data: bytes) -> None:
         """Take in how many messages of a channel the last chunk or gap holds, and their times."""
-        entries = data[6:]
-        whole = entries[: len(entries) // 16 * 16]
-        times = [time for time, _ in struct.iter_unpack('<QQ', whole)]
+        whole = 6 + (len(data) - 6) // 16 * 16
+        times = [time for time, _ in struct.iter_unpack('<QQ', data[6 : max(whole, 6)])]
         self._indexed[int.from_bytes(data[:2], 'little')] += len(times)
         if self.blocks and self.blocks[-1].counts is self._indexed:
             block = self.blocks[-1]
