@@ -15,7 +15,7 @@ even in stored values, not in light, so both the data and the prior are weighted
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import cv2
@@ -32,6 +32,7 @@ EPSILON = 0.01  # stored units; differences below this count as noise
 EXPONENT = 0.8  # alpha of the prior [KF09]
 SPACING = 1.5  # px of the longest blur between two instants of the exposure
 COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
+CLEAN = 0.003  # sigma [stored units] up to which all steps are worth it
 # Least sigma [stored units]: 8 bit rounding for averaged values; real cameras hide their noise
 # from the estimate by demosaicing, and lens and shutter leave more unexplained.
 SIGMA_FLOOR = {'linear': 0.0025, 'srgb': 0.012}
@@ -74,18 +75,31 @@ def restore_coarse_to_fine(
     """
     Give the sharp image (H, W, 3), stored values, under a known motion; depth (H, W) filled [m].
 
-    At half the size an eighth of the work brings most of what is long and slow to converge.
+    At half the size an eighth of the work brings most of what is long and slow to converge, and
+    so on. Noise makes the prior weigh more, which takes fewer steps.
     """
-    sigma, first = noise_sigma(blurred), None
+    sigma = noise_sigma(blurred)
+    worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
+    steps = replace(steps, inner=math.ceil(worth * steps.inner))
+    return _restored(blurred, depth, motion, camera, (sigma, steps))
+
+
+def _restored(
+    blurred: FloatImage,
+    depth: FloatImage,
+    motion: Motion,
+    camera: CameraIntrinsics,
+    effort: tuple[float, LatentSteps],
+) -> FloatImage:
+    """Restore from the image of half the size, as long as there is one; effort: noise, steps."""
+    first, (sigma, steps) = None, effort
     width, height = camera.width // 2, camera.height // 2
     if min(width, height) >= MIN_SIDE:
         small = _resized(blurred, width, height, cv2.INTER_AREA)
         near = _resized(depth, width, height, cv2.INTER_NEAREST)
-        blur = blur_operator(motion, near, camera.scaled(width, height), SPACING)
-        inner = round(COARSE_LONGER * steps.inner)
-        coarse = LatentSteps(steps.prior, COARSE_OUTER, inner)
+        coarse = LatentSteps(steps.prior, COARSE_OUTER, round(COARSE_LONGER * steps.inner))
         # Four pixels in one: half the noise.
-        half = restore_latent(small, blur, camera.transfer, sigma / 2, coarse)
+        half = _restored(small, near, motion, camera.scaled(width, height), (sigma / 2, coarse))
         first = np.clip(_resized(half, camera.width, camera.height, cv2.INTER_CUBIC), 0, 1)
     blur = blur_operator(motion, depth, camera, SPACING)
     return restore_latent(blurred, blur, camera.transfer, sigma, steps, first=first)
