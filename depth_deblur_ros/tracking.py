@@ -2,13 +2,14 @@
 What one frame tells the next: the sign of the motion, the exposure, where to start.
 
 The same for a recording, which may look one frame ahead, and for a live camera, which may not.
-A frame goes through these steps, docs/method.md (40) to (53):
+A frame goes through these steps, docs/method.md (40) to (58):
 1 between.py: the motion from the last frame to this one, and on to the following one if known
 2 glide.py: these and the past give the velocity u at this frame, with its covariance, seen
   through a shutter that may roll and stamps that may jitter (habits.py, cadence.py)
 3 the solver finds the motion p in the blur, u times the exposure being a further start
-4 joining.py: p against u tells the sign, and the exposure where nobody does (shutter.py); both
-  together are the motion; the image is restored anew where that is another one
+4 joining.py: p against u tells the sign, and the exposure where nobody does (shutter.py), as
+  changes of sharpness do (softening.py); both together are the motion; the image is restored
+  anew where that is another one
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from typing import Any, Protocol, runtime_checkable
 
 from depth_deblur_ros.between import Between, motion_between, row_skew, View, view_of
 from depth_deblur_ros.cadence import Cadence
-from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame
+from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame, Vector
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
-from depth_deblur_ros.glide import unknown_glide, Way
+from depth_deblur_ros.glide import Glide, unknown_glide, Way
 from depth_deblur_ros.gyro import Gyro
 from depth_deblur_ros.habits import Habits
 from depth_deblur_ros.joining import Context, GUESS, join, Joined
 from depth_deblur_ros.shutter import Exposure, Shutter
+from depth_deblur_ros.softening import exposure_from_softness
 import numpy as np
 
 GAP_S = 0.25  # frames farther apart are not neighbours
@@ -132,6 +134,7 @@ class Tracker:
         params: SolverParams,
     ) -> Context:
         """Go on to a frame, look at the following one, ask the gyro."""
+        before = self._last, self._glide
         seen = self._arrive(frame, params)
         glide, known = self._glide, seen.between is not None
         self._ahead = self._seen(following, seen, params) if following else None
@@ -141,8 +144,22 @@ class Tracker:
             known = True
         look = np.eye(6, 12)
         look[:, 6:] = self._habits.readout * self._cadence.usual * row_skew(seen.view)
+        if told is None:
+            self._compare(before, seen, look @ glide.mean)
         context = Context(glide, self._shutter, told, self._cadence.usual, known, look)
         return self._turned(frame.stamp_ns, context, params)
+
+    def _compare(self, before: tuple[Seen | None, Glide], seen: Seen, now: Vector) -> None:
+        """Let the change of sharpness since the last frame tell the exposure, (58)."""
+        last, glide = before
+        if last is None or seen.between is None:
+            return
+        then = glide.before(*self._way(seen.between, self._cadence)).velocity
+        views, way, usual = (last.view, seen.view), seen.between.motion, self._cadence.usual
+        known = self._shutter.exposure
+        found = exposure_from_softness(views, way, (then, now), known, usual)
+        if found:
+            self._shutter = self._shutter.measured(found)[0]
 
     def _turned(self, stamp_ns: int, context: Context, params: SolverParams) -> Context:
         """Let the gyro tell the turn over the exposure."""

@@ -1,7 +1,7 @@
 """
 Make bags of blurred streams with known motion, exposure and gyro: hand-held and driven cameras.
 
-usage: python scripts/make_streams.py FOLDER [NAME ...] [--frames N]
+usage: python scripts/make_streams.py FOLDER [NAME ...] [--frames N] [--seed N]
 
 Each bag holds the topics of make_sample_bag.py but the exposure, which changes in steps between 30
 and 90 % of the frame interval and is not told, and a gyro. Truth stands on /ground_truth topics.
@@ -51,14 +51,20 @@ class Stream:
         return SHARES[(self.first_share + number // HELD) % len(SHARES)] / RATE
 
 
-STREAMS = {
-    'hand1': Stream(3, hand_held(seed=27, turn=1.1, speed=0.4), 0),
-    'hand2': Stream(5, hand_held(seed=31, turn=0.7, speed=0.5), 2),
-    'hand3': Stream(8, hand_held(seed=35, turn=1.6, speed=0.3), 4),
-    'robot1': Stream(4, driven(seed=1, turn=0.8, speed=0.6), 1),
-    'robot2': Stream(6, driven(seed=2, turn=1.2, speed=0.4), 3),
-    'robot3': Stream(7, driven(seed=3, turn=0.5, speed=0.8), 5),
-}
+APART = 100  # between the seeds of one set of streams and the next
+
+
+def streams(seed: int) -> dict[str, Stream]:
+    """Give the streams by name; other seeds give other rooms and paths of the same kinds."""
+    other = APART * seed
+    return {
+        'hand1': Stream(3 + other, hand_held(seed=27 + other, turn=1.1, speed=0.4), 0),
+        'hand2': Stream(5 + other, hand_held(seed=31 + other, turn=0.7, speed=0.5), 2),
+        'hand3': Stream(8 + other, hand_held(seed=35 + other, turn=1.6, speed=0.3), 4),
+        'robot1': Stream(4 + other, driven(seed=1 + other, turn=0.8, speed=0.6), 1),
+        'robot2': Stream(6 + other, driven(seed=2 + other, turn=1.2, speed=0.4), 3),
+        'robot3': Stream(7 + other, driven(seed=3 + other, turn=0.5, speed=0.8), 5),
+    }
 
 
 def stamp_of(time: float) -> int:
@@ -111,11 +117,13 @@ def main() -> None:
     """Write the bags."""
     parser = argparse.ArgumentParser(description='Make bags of blurred streams with known motion.')
     parser.add_argument('folder', type=Path)
-    parser.add_argument('names', nargs='*', metavar='NAME', help=f'of {", ".join(STREAMS)}')
+    parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(streams(0)))
     parser.add_argument('--frames', type=int, default=FRAMES)
+    parser.add_argument('--seed', type=int, default=0, help='of other rooms and paths')
     args = parser.parse_args()
-    for name in args.names or STREAMS:
-        stream = STREAMS[name]
+    known = streams(args.seed)
+    for name in args.names or known:
+        stream = known[name]
         scene = make_scene(stream.scene_seed)
         with BagWriter(args.folder / name) as bag:
             write_gyro(bag, stream.path, args.frames / RATE)

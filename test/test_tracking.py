@@ -76,10 +76,12 @@ def test_the_solver_starts_where_the_neighbours_point():
 
 
 def test_a_step_of_the_exposure_is_followed_within_two_frames():
-    frames, solve = [frame(i) for i in range(10)], Knowing()
+    exposures = [0.01 if i < 4 else 0.022 for i in range(10)]
+    frames = [frame(i, open_for=exposure) for i, exposure in enumerate(exposures)]
+    solve = Knowing()
     tracker = Tracker(solve)
     for i, (f, n) in enumerate(itertools.pairwise(frames)):
-        solve.exposure = 0.01 if i < 4 else 0.022
+        solve.exposure = exposures[i]
         found = tracker.follow(f, MOTION, n)
         if i not in (0, 4):
             assert found.exposure.seconds == pytest.approx(solve.exposure, rel=0.15), i

@@ -10,6 +10,7 @@ K = np.array([[160.0, 0, 95.5], [0, 160.0, 71.5], [0, 0, 1]])
 STEP_NS = 33_000_000
 START_NS = 1_700_000_000_000_000_000
 EXPOSURE = 0.015
+SHOTS = 7  # of one exposure
 RNG = np.random.default_rng(5)
 WALL = cv2.GaussianBlur(RNG.random((500, 900), np.float32), (0, 0), 2.5)
 WALL = np.clip((WALL - WALL.mean()) / (6 * WALL.std()) + 0.5, 0, 1)
@@ -33,11 +34,17 @@ def picture(seconds):
     return np.repeat(np.clip(grey, 0, 1)[..., None], 3, 2)
 
 
-def frame(number, seconds=None, exposure=None, image=None):
+def blurred(seconds, exposure):
+    """Give what the camera sees during an exposure around that time."""
+    times = seconds + exposure * (np.arange(SHOTS) - (SHOTS - 1) / 2) / SHOTS
+    return np.mean([picture(time) for time in times], axis=0, dtype=np.float32)
+
+
+def frame(number, seconds=None, exposure=None, image=None, open_for=EXPOSURE):
     """Give the frame of that number: its stamp, and what is seen at that time on the path."""
     seconds = number * STEP_NS / 1e9 if seconds is None else seconds
     return RgbdFrame(
-        picture(seconds) if image is None else image,
+        blurred(seconds, open_for) if image is None else image,
         DEPTH,
         CAMERA,
         exposure,
