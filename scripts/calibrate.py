@@ -2,22 +2,24 @@
 Ask whether the covariance of the motion is right, on rendered frames with known motion.
 
 usage: python scripts/calibrate.py [--frames N] [--first N] [--modes MODE ...] [--workers N]
-       [--plot FILE.svg] [--worst FOLDER]
+       [--keep FILE.jsonl] [--plot FILE.svg] [--worst FOLDER]
 
 Rooms, paths and blurs (2 to 40 px) are drawn anew for each frame, from numbers that nothing else
 in the project uses; the solver's constants were set on some of the first 300, so --first 300 asks
 frames that are new to it. Prints, for each mode and axis of the motion, how many of the true
 motions lie within one and three standard deviations of what was solved, but for the sign; the
-plot tells it for all numbers of deviations. --worst draws the five frames with the worst flow.
+plot tells it for all numbers of deviations. --worst draws the five frames with the worst flow;
+with --keep a run that was ended goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+import json
 from pathlib import Path
 
 from depth_deblur_ros.charts import chart, Curve, Panel
@@ -88,7 +90,7 @@ class Answer:
     number: int
     blur: float
     outcome: Outcome
-    error: Array | None = None
+    error: list[float] | None = None
     miss: float = 0.0
 
 
@@ -111,15 +113,36 @@ def asked(number: int, modes: Sequence[str]) -> list[Answer]:
         answer = Answer(number, shot.blur, result.outcome)
         if result.outcome is Outcome.SOLVED:
             error, miss = deviations(shot, result)
-            answer = replace(answer, error=error, miss=miss)
+            answer = replace(answer, error=error.tolist(), miss=miss)
         answers.append(answer)
     return answers
+
+
+def all_asked(numbers: Sequence[int], args: argparse.Namespace) -> Iterator[list[Answer]]:
+    """Ask frame after frame, in so many processes."""
+    work = partial(asked, modes=args.modes)
+    if args.workers == 1:
+        yield from map(work, numbers)
+        return
+    with ProcessPoolExecutor(args.workers) as pool:
+        yield from pool.map(work, numbers)
+
+
+def read_kept(path: Path, modes: Sequence[str]) -> dict[int, list[Answer]]:
+    """Read the frames that were asked before in all of these modes."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    kept = {}
+    for record in map(json.loads, lines):
+        if set(modes) <= set(record):
+            answers = [Answer(**record[mode]) for mode in modes]
+            kept[answers[0].number] = answers
+    return kept
 
 
 def printed(mode: str, answers: Sequence[Answer]) -> None:
     """Print the table of one mode."""
     solved = [answer for answer in answers if answer.error is not None]
-    counts = [f'{sum(a.outcome is o for a in answers)} {o}' for o in Outcome]
+    counts = [f'{sum(a.outcome == o for a in answers)} {o}' for o in Outcome]
     misses = [answer.miss for answer in solved]
     print(f'mode {mode}: {", ".join(counts)}')
     print(f'flow error {np.mean(misses):.2f} px, median {np.median(misses):.2f} px')
@@ -163,16 +186,21 @@ def main() -> None:
     parser.add_argument('--first', type=int, default=0)
     parser.add_argument('--modes', nargs='+', choices=MODES, default=['full', 'motion'])
     parser.add_argument('--workers', type=int, default=1)
+    parser.add_argument('--keep', type=Path)
     parser.add_argument('--plot', type=Path)
     parser.add_argument('--worst', type=Path)
     args = parser.parse_args()
     numbers = range(args.first, args.first + args.frames)
-    work = partial(asked, modes=args.modes)
-    if args.workers == 1:
-        rows = list(map(work, numbers))
-    else:
-        with ProcessPoolExecutor(args.workers) as pool:
-            rows = list(pool.map(work, numbers))
+    kept = read_kept(args.keep, args.modes) if args.keep else {}
+    missing = [number for number in numbers if number not in kept]
+    for number, answers in zip(missing, all_asked(missing, args), strict=True):
+        kept[number] = answers
+        if args.keep:
+            with args.keep.open('a') as file:
+                file.write(
+                    json.dumps(dict(zip(args.modes, map(asdict, answers), strict=True))) + '\n'
+                )
+    rows = [kept[number] for number in numbers]
     columns = dict(zip(args.modes, zip(*rows, strict=True), strict=True))
     for mode, answers in columns.items():
         printed(mode, answers)

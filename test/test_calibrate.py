@@ -51,8 +51,9 @@ def test_the_tables_count_what_each_mode_said(shot, tmp_path, monkeypatch, capsy
 
     monkeypatch.setattr(calibrate, 'take', lambda number: shot)
     monkeypatch.setattr(calibrate, 'deblur', solved)
-    plot = tmp_path / 'plot.svg'
-    monkeypatch.setattr(sys, 'argv', ['calibrate.py', '--frames', '2', '--plot', str(plot)])
+    plot, keep = tmp_path / 'plot.svg', tmp_path / 'kept.jsonl'
+    line = ['calibrate.py', '--frames', '2', '--plot', str(plot), '--keep', str(keep)]
+    monkeypatch.setattr(sys, 'argv', line)
     calibrate.main()
     lines = capsys.readouterr().out.splitlines()
     full, motion = (
@@ -68,3 +69,6 @@ def test_the_tables_count_what_each_mode_said(shot, tmp_path, monkeypatch, capsy
             == f'{name} within 1 sigma 0.0 %, within 3 sigma 100.0 %'.split()
         )
     assert 'mode motion' in plot.read_text()
+    monkeypatch.setattr(calibrate, 'take', None)  # nothing is rendered again
+    calibrate.main()
+    assert capsys.readouterr().out.splitlines() == lines

@@ -1,5 +1,7 @@
 """The blind start on straight blurs of a texture: found, not invented, the same each time."""
 
+from types import SimpleNamespace
+
 import cv2
 from depth_deblur_ros.core import start
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
@@ -141,11 +143,24 @@ def said(monkeypatch):
 
 
 def test_a_single_scale_must_say_more_of_a_blur_below_16_px(said):
-    q = np.zeros(6)
-    assert start._trusted(q, 20.0, said(-0.16), 1.0)
-    assert not start._trusted(q, 12.0, said(-0.16), 1.0)
-    assert start._trusted(q, 12.0, said(-0.18), 1.0)
-    assert start._trusted(q, 12.0, said(-0.16, -0.1), 1.0)  # two scales do not need it
+    q, soft = np.zeros(6), SimpleNamespace(along=1.0, coarse=1.0)
+    assert start._trusted(q, 20.0, said(-0.16), soft)
+    assert not start._trusted(q, 12.0, said(-0.16), soft)
+    assert start._trusted(q, 12.0, said(-0.18), soft)
+    assert start._trusted(q, 12.0, said(-0.16, -0.1), soft)  # two scales do not need it
+
+
+def test_what_is_sharp_at_half_the_size_has_no_long_blur(said):
+    q, sure = np.zeros(6), said(-0.3, -0.3)
+    assert not start._trusted(q, 35.0, sure, SimpleNamespace(along=1.0, coarse=1.07))
+    assert start._trusted(q, 35.0, sure, SimpleNamespace(along=1.1, coarse=1.05))  # noise
+
+
+def test_a_long_blur_is_found_in_noise():
+    true = sideways(36, 0.4)
+    result = blind_start(swept(texture(1), 36, 0.4, 0.02), DEPTH, CAMERA)
+    assert result.outcome is Outcome.SOLVED
+    assert flow_error(result, true) < 2
 
 
 def test_a_short_blur_must_show_close_up_and_from_5_px_on_at_full_scale_too(said):

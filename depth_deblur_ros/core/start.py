@@ -26,7 +26,7 @@ from depth_deblur_ros.core.search import (
     look,
     Scale,
 )
-from depth_deblur_ros.core.trust import covariance_from_curvature, sharpness
+from depth_deblur_ros.core.trust import covariance_from_curvature, Edges
 import numpy as np
 
 ASTRAY = 6.0  # px from the guess, beyond which all is searched
@@ -48,7 +48,8 @@ CLEARLY_SHARP, RATHER_SHARP = (
 )  # trust.sharpness: nothing to search; no motion and no blur
 OUT_OF_FOCUS = 1.07  # trust.sharpness across the motion, which leaves that as it is
 EDGED = 1.035  # edges of a picture with so little blur that it is seen close up alone
-LONG, LONGEST = 20.0, 30.0  # px; few pictures, and none, with such a blur are EDGED
+LONG, LONGEST = 20.0, 30.0  # px; few, and hardly any, pictures with such a blur have edges
+EDGED_COARSE = 1.06  # like these at half the size, where noise makes none: DOUBT, and twice
 SMEARED, SMEAR = 1.005, 8.0  # edges that no blur below so many px leaves
 BELIEF = 0.4  # common -S at which a motion is taken for certain
 # Where the full scale is the only one, what has less quality is wrong one time in four: variance.
@@ -81,10 +82,10 @@ def blind_start(
     alike.
     """
     axes = motion_axes(depth, camera)
-    edges, across = sharpness(grey)
-    if edges > CLEARLY_SHARP:
+    edges = Edges(grey)
+    if edges.along > CLEARLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
-    spectra = look(grey, depth, camera, axes) if across > OUT_OF_FOCUS else {}
+    spectra = look(grey, depth, camera, axes) if edges.across > OUT_OF_FOCUS else {}
     if not spectra:
         return _nothing(Outcome.FAILED, axes)
 
@@ -94,7 +95,7 @@ def blind_start(
     first = np.asarray(np.linalg.solve(axes, guess.vector)) if guess else None
     q, scales = _found(spectra, first, length, edges)
     trusted = _trusted(q, length(q), scales, edges)
-    look_closer = length(q) < CLOSE_BELOW if trusted else edges > EDGED
+    look_closer = length(q) < CLOSE_BELOW if trusted else edges.along > EDGED
     if look_closer:
         close = close_up(grey, depth, camera, axes)
         closer, both = find_short(scales[0], close, q if trusted else None)
@@ -103,7 +104,7 @@ def blind_start(
         elif len(scales) == 1:  # nobody has confirmed it
             trusted = False
     if not trusted:
-        return _nothing(Outcome.SHARP if edges > RATHER_SHARP else Outcome.FAILED, axes)
+        return _nothing(Outcome.SHARP if edges.along > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     covariance = _covariance(q, scales, axes)
     if len(scales) == 1 and quality < LONELY:
@@ -117,7 +118,7 @@ def _found(
     spectra: dict[int, Spectra],
     first: Vector | None,
     length: Callable[[Vector], float],
-    edges: float,
+    edges: Edges,
 ) -> tuple[Vector, list[Scale]]:
     """Search around the guess, and everywhere where that gives nothing to believe."""
     if first is not None:
@@ -127,17 +128,16 @@ def _found(
     return find(spectra, first)
 
 
-def _trusted(q: Vector, length: float, scales: list[Scale], edges: float) -> bool:
+def _trusted(q: Vector, length: float, scales: list[Scale], edges: Edges) -> bool:
     """Tell whether the bands are deep enough for a blur of this length [px]."""
-    too_soft = length < SMEAR and edges < SMEARED
-    too_sharp = length > LONGEST and edges > EDGED
-    if length < SHORTEST or too_soft or too_sharp:
+    if length < SHORTEST or (length < SMEAR and edges.along < SMEARED):
         return False
     if length < SHORT:
         return bool(scores(q[None], scales[0].evidence)[0] < -SHORT_TRUST)
-    sharp = edges > (EDGED if length > LONG else RATHER_SHARP)
+    sharp = edges.coarse > EDGED_COARSE if length > LONG else edges.along > RATHER_SHARP
+    doubt = DOUBT ** (sharp + (sharp and length > LONGEST))
     alone = ALONE_TRUST if length > ALONE_SHORT else ALONE_SHORT_TRUST
-    needed = (LONG_TRUST if len(scales) > 1 else alone) * (DOUBT if sharp else 1)
+    needed = doubt * (LONG_TRUST if len(scales) > 1 else alone)
     return bool(common_score(q[None], scales)[0] < -needed)
 
 

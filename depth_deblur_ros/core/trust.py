@@ -9,6 +9,8 @@ docs/method.md (13), (14).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 import math
 
 import cv2
@@ -23,6 +25,33 @@ ENOUGH = 15_000  # pixels or more that are looked at; the ratio is then good to 
 # what no picture tells better of q: two shifts, roll, zoom, two parallaxes [px].
 OF_SPECTRA, OF_LIKELIHOOD = 0.15, 0.36
 LEAST_ERROR = (0.1, 0.1, 0.18, 0.05, 0.03, 0.03)
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """How sharp a grey picture (H, W) is, as `sharpness` counts it."""
+
+    grey: FloatImage
+
+    @property
+    def along(self) -> float:
+        """In the direction where it is least sharp."""
+        return self._fine[0]
+
+    @property
+    def across(self) -> float:
+        """In the direction where it is sharpest."""
+        return self._fine[1]
+
+    @cached_property
+    def coarse(self) -> float:
+        """Where it is least sharp, at half the size: noise hides long blurs at the full one."""
+        half = cv2.resize(self.grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        return sharpness(np.asarray(half, np.float32))[0]
+
+    @cached_property
+    def _fine(self) -> tuple[float, float]:
+        return sharpness(self.grey)
 
 
 def sharpness(grey: FloatImage) -> tuple[float, float]:
