@@ -24,7 +24,7 @@ from depth_deblur_ros.live import compile_kernels, end_work
 from depth_deblur_ros.memory import keep_freed_memory
 from depth_deblur_ros.messages import compressed_fields, Fields, filled, stamp_ns
 from depth_deblur_ros.pipeline import Pipeline
-from depth_deblur_ros.results import DEPTH, IMAGE, TYPES
+from depth_deblur_ros.results import COMPRESSED, DEPTH, IMAGE, LIVE_TYPES
 from depth_deblur_ros.settings import DECLARED, READ_ONLY, Settings, settings_from
 from depth_deblur_ros.tracking import Solver
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -52,7 +52,6 @@ NAME = 'depth_deblur'
 QUEUE = 10  # messages per topic, in and out
 INACTIVE, TIME_JUMP = 'the node was deactivated', 'ROS time jumped back'
 IDLE, CHANGED = 'the last subscriber left', 'the input topics were changed'
-COMPRESSED = f'{IMAGE}/compressed'
 PICTURES = (IMAGE, DEPTH, COMPRESSED)
 DONE, REFUSED = 0, 2  # exit codes
 PATIENCE_S = 0.5  # for the frame that is being solved at the end
@@ -141,7 +140,7 @@ class DeblurNode(LifecycleNode):  # type: ignore[misc]
 
     def _configure(self) -> None:
         self.release()  # what an earlier attempt left
-        for topic, kind in {**TYPES, COMPRESSED: 'sensor_msgs/msg/CompressedImage'}.items():
+        for topic, kind in LIVE_TYPES.items():
             self._outputs[topic] = self.create_publisher(
                 _CLASSES[kind],
                 topic,

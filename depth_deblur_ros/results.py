@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 IMAGE = 'deblurred/image'
+COMPRESSED = f'{IMAGE}/compressed'
 CAMERA_INFO = 'deblurred/camera_info'
 DEPTH = 'deblurred/depth'
 MOTION = 'motion'
@@ -38,6 +39,7 @@ TYPES = {
     DISPLACEMENT: 'geometry_msgs/msg/TwistStamped',
     RESULT: 'diagnostic_msgs/msg/DiagnosticStatus',
 }
+LIVE_TYPES = {**TYPES, COMPRESSED: 'sensor_msgs/msg/CompressedImage'}
 
 # (m/s)^2, (rad/s)^2 of a frame without a motion to trust: as good as nothing, but a number.
 UNKNOWN_VARIANCE = 1e6

@@ -1,14 +1,51 @@
-"""Write config/deblur.yaml, the camera presets and the README's parameter tables from the code."""
+"""Write config/deblur.yaml, the camera presets and the README's tables from the code."""
 
+from collections.abc import Iterable
 from dataclasses import Field, fields
+import json
 from pathlib import Path
 from typing import Any
 
 from depth_deblur_ros.core.params import knobs
-from depth_deblur_ros.settings import NodeParams
+from depth_deblur_ros.results import COMPRESSED, LIVE_TYPES, TYPES
+from depth_deblur_ros.settings import NodeParams, settings_from
 
 ROOT = Path(__file__).resolve().parents[1]
-TABLES = {'parameters': knobs(), 'node parameters': fields(NodeParams)}
+RESULTS = {  # what the README says of each topic in TYPES
+    'deblurred/image': 'the sharp image',
+    'deblurred/camera_info': 'its camera, without distortion if it was undone',
+    'deblurred/depth': 'the filled depth, 32FC1, metres',
+    'displacement': 'its way over the exposure, rad and metres; always',
+    'motion': "the camera's own velocity; only when the sign and the exposure are known",
+    'motion_with_covariance': 'the same, when the exposure is known; sign open: mean 0 and a covariance '
+    'that spans both signs',
+    'result': 'outcome, quality, sign_resolved, blur_px, seconds, exposure where it is known',
+}
+INPUTS = {  # and of each source of the live node
+    'colour': 'in: rgb8, bgr8, rgba8, bgra8, mono8, mono16, 16-bit colour, Bayer',
+    'depth': "in: 16UC1 (millimetres) or 32FC1 (metres), of the colour's size",
+    'camera_info': 'in, unless the parameter `camera` tells it',
+    'exposure': 'in, seconds, optional; the latest before an image counts, else `exposure_s`, '
+    'else it is estimated',
+    'imu': "in, optional: its gyro; `gyro_rotation` turns its axes into the camera's",
+}
+OTHERS = (
+    (COMPRESSED, LIVE_TYPES[COMPRESSED], 'out: the sharp image as JPEG'),
+    (
+        '/diagnostics',
+        'diagnostic_msgs/msg/DiagnosticArray',
+        'out, once a second: rates, latency, every lost frame with its reason',
+    ),
+)
+MODES = {  # the motion, the image, what for
+    'full': (
+        'found and refined',
+        'all rounds of the image step (`reweightings`, `cg_steps`)',
+        'pictures, data sets, SLAM after the fact',
+    ),
+    'fast': ('found', 'fewer rounds: softer where the blur is long', 'live'),
+    'motion': ('found', 'left as it is', 'odometry: costs the search alone'),
+}
 TUM = {
     'colour_topic': '/camera/rgb/image_color',
     'depth_topic': '/camera/depth/image',
@@ -60,16 +97,20 @@ def yaml_text() -> str:
         '  ros__parameters:',
         '    # --- the solver, here and on the command line ---',
     ]
-    for name, declared in TABLES.items():
-        if name == 'node parameters':
-            lines.append('    # --- the live node alone ---')
-        for knob in declared:
-            limits = f'; {_limits(knob)}' if _limits(knob) else ''
-            lines += [
-                f'    # {knob.metadata["help"]}{limits}',
-                f'    {knob.name}: {_value(knob.default)}',
-            ]
+    lines += _entries(knobs())
+    lines += ['    # --- the live node alone ---', *_entries(fields(NodeParams))]
     return '\n'.join(lines) + '\n'
+
+
+def _entries(declared: tuple[Field[Any], ...]) -> list[str]:
+    lines = []
+    for knob in declared:
+        limits = f'; {_limits(knob)}' if _limits(knob) else ''
+        lines += [
+            f'    # {knob.metadata["help"]}{limits}',
+            f'    {knob.name}: {_value(knob.default)}',
+        ]
+    return lines
 
 
 def preset_text(name: str) -> str:
@@ -91,12 +132,47 @@ def table_text(declared: tuple[Field[Any], ...]) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def with_table(readme: str) -> str:
+def topics_text(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Give topics with their types, and what is said of them, as a Markdown table."""
+    lines = ['| topic | type | |', '|---|---|---|']
+    lines += [f'| `{name}` | {kind.replace("/msg/", "/")} | {text} |' for name, kind, text in rows]
+    return '\n'.join(lines) + '\n'
+
+
+def modes_text() -> str:
+    """Give the modes with their CPU times, as scripts/bench_speed.py left them."""
+    spent = json.loads((ROOT / 'docs/speed.json').read_text())['modes']
+    lines = [
+        '| `mode` | the motion | the image | first frame, next ones | for |',
+        '|---' * 5 + '|',
+    ]
+    for mode, (motion, image, purpose) in MODES.items():
+        found = [spent.get(f'{mode}, {start}') for start in ('cold', 'tracking')]
+        cost = ', '.join(f'{entry["cpu"]:.2g} s' for entry in found if entry)
+        lines.append(f'| {mode} | {motion} | {image} | {cost} | {purpose} |')
+    return '\n'.join(lines) + '\n'
+
+
+def tables() -> dict[str, str]:
+    """Give the tables of the README by their marks."""
+    sources = settings_from({}).sources()
+    taken = [(source.topic, source.kind, INPUTS[k]) for k, source in sources.items()]
+    given = [(name, kind, RESULTS[name]) for name, kind in TYPES.items()]
+    return {
+        'results': topics_text(given),
+        'node topics': topics_text([*taken, *OTHERS]),
+        'modes': modes_text(),
+        'parameters': table_text(knobs()),
+        'node parameters': table_text(fields(NodeParams)),
+    }
+
+
+def with_tables(readme: str) -> str:
     """Give the README with the tables between their marks renewed."""
-    for name, declared in TABLES.items():
+    for name, text in tables().items():
         begin, end = f'<!-- {name} -->\n', f'<!-- end of {name} -->\n'
         head, rest = readme.split(begin)
-        readme = head + begin + table_text(declared) + end + rest.split(end)[1]
+        readme = head + begin + text + end + rest.split(end)[1]
     return readme
 
 
@@ -122,4 +198,4 @@ if __name__ == '__main__':
     for preset in PRESETS:
         (ROOT / f'config/presets/{preset}.yaml').write_text(preset_text(preset))
     page = ROOT / 'README.md'
-    page.write_text(with_table(page.read_text()))
+    page.write_text(with_tables(page.read_text()))

@@ -120,7 +120,7 @@ def test_config_and_readme_are_up_to_date():
     written = runpy.run_path(str(ROOT / 'scripts/write_defaults.py'))
     readme = (ROOT / 'README.md').read_text()
     assert (ROOT / 'config/deblur.yaml').read_text() == written['yaml_text']()
-    assert readme == written['with_table'](readme), 'run scripts/write_defaults.py'
+    assert readme == written['with_tables'](readme), 'run scripts/write_defaults.py'
     presets = {path.stem: path.read_text() for path in (ROOT / 'config/presets').iterdir()}
     assert presets == {name: written['preset_text'](name) for name in written['PRESETS']}
 
