@@ -17,8 +17,8 @@ RESULTS = {  # what the README says of each topic in TYPES
     'deblurred/depth': 'the filled depth, 32FC1, metres',
     'displacement': 'its way over the exposure, rad and metres; always',
     'motion': "the camera's own velocity; only when the sign and the exposure are known",
-    'motion_with_covariance': 'the same, when the exposure is known; sign open: mean 0 and a covariance '
-    'that spans both signs',
+    'motion_with_covariance': 'the same, when the exposure is known; sign open: mean 0 '
+    'and a covariance that spans both signs',
     'result': 'outcome, quality, sign_resolved, blur_px, seconds, exposure where it is known',
 }
 INPUTS = {  # and of each source of the live node
