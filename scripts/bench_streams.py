@@ -1,22 +1,27 @@
 """
 Measure what tracking tells on the bags of make_streams.py, through replay.
 
-usage: python scripts/bench_streams.py FOLDER [--imu KIND] [--mode MODE] [--live]
+usage: python scripts/bench_streams.py FOLDER [--imu KIND] [--mode MODE] [--live | --no-ahead]
 
 One line per bag: median error of the exposure; rms error of the angular and the linear velocity
-over that of no motion, frames that tell none counting as such; sign and told in percent.
+over that of no motion, frames that tell none counting as such; sign and told in percent. Of a bag
+of break_streams.py: the first right frame after the break, and how many of the frames are right.
+Through replay, or with --live through the live node, over DDS.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 import json
 from pathlib import Path
 import tempfile
 from types import SimpleNamespace
 from typing import Any
 
+from break_streams import AFTER
 from depth_deblur_ros import replay as replaying
 from depth_deblur_ros.bag import BagReader, decoded
 from depth_deblur_ros.core.params import MODES, SolverParams
@@ -26,7 +31,10 @@ import numpy.typing as npt
 
 TRUTH, TOLD = '/ground_truth/motion', '/ground_truth/exposure'
 LATE_NS = 50_000_000
+RIGHT, SLOW = 0.25, 0.1  # of the velocity; of the usual one, below which an error is none
+AWAY = 2.0  # m; at this depth, a shift counts as much as a turn
 Array = npt.NDArray[np.float64]
+Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,7 @@ class Score:
     shift: float
     sign: float
     told: float
+    errors: tuple[float, ...] = ()  # of each frame's exposure
 
     def __str__(self) -> str:
         return (
@@ -86,36 +95,54 @@ def look_ahead_no_more() -> None:
     replaying._with_next = lambda pairs: ((pair, None) for pair, _ in given(pairs))
 
 
-def score(records: list[dict[str, Any]], twists: Array, exposures: Array) -> Score:
-    """Compare the estimates of a bag with its truth."""
-    found, right = np.zeros_like(twists), []
-    off = np.ones(len(records))
+def velocities(records: list[Record]) -> Array:
+    """Give the velocities (n, 6) that are told, angular first; NaN where none is."""
+    found = np.full((len(records), 6), np.nan)
     for k, record in enumerate(records):
-        if record['exposure'] is None:
-            continue
-        off[k] = abs(record['exposure'] / exposures[k] - 1)
-        if record['sign_resolved']:
-            found[k] = -np.array(record['theta'] + record['v']) / record['exposure']
-            right.append(found[k, :3] @ twists[k, :3] > 0)
-    miss, whole = np.square(found - twists), np.square(twists)
+        if record['exposure'] is not None and record['sign_resolved']:
+            found[k] = -np.array([*record['theta'], *record['v']]) / record['exposure']
+    return found
+
+
+def score(records: list[Record], twists: Array, exposures: Array) -> Score:
+    """Compare the estimates of a bag with its truth."""
+    told = velocities(records)
+    known = ~np.isnan(told[:, 0])
+    off = [
+        1.0 if record['exposure'] is None else abs(record['exposure'] / exposure - 1)
+        for record, exposure in zip(records, exposures, strict=True)
+    ]
+    right = np.sum(told[known, :3] * twists[known, :3], axis=1) > 0
+    miss, whole = np.square(np.nan_to_num(told) - twists), np.square(twists)
     return Score(
         exposure=float(np.median(off)),
         turn=float(np.sqrt(miss[:, :3].sum() / whole[:, :3].sum())),
         shift=float(np.sqrt(miss[:, 3:].sum() / whole[:, 3:].sum())),
-        sign=float(np.mean(right)) if right else 0.5,
-        told=len(right) / len(records),
+        sign=float(np.mean(right)) if known.any() else 0.5,
+        told=float(np.mean(known)),
+        errors=tuple(off),
     )
 
 
-def measured(bag: Path, mode: str) -> Score:
-    """Replay a bag and score it."""
+def right_again(records: list[Record], twists: Array) -> str:
+    """Tell which frame after a break has the first right velocity, and how many have one."""
+    scale = np.repeat([1.0, 1 / AWAY], 3)
+    found, true = velocities(records)[-AFTER:] * scale, twists[-AFTER:] * scale
+    usual = np.sqrt(np.mean(np.square(twists * scale).sum(axis=1)))
+    size = np.maximum(np.linalg.norm(true, axis=1), SLOW * usual)
+    right = np.linalg.norm(found - true, axis=1) <= RIGHT * size
+    first = str(1 + int(np.argmax(right))) if right.any() else 'none'
+    return f'| {first} | {right.sum()} of {AFTER} |'
+
+
+def replayed(bag: Path, mode: str) -> list[Record]:
+    """Replay a bag and give its estimates."""
     with tempfile.TemporaryDirectory() as folder:
         lines = Path(folder) / 'motion.jsonl'
         replaying.replay(
             bag, Path(folder) / 'out', params=SolverParams(mode=mode), estimates=lines
         )
-        records = [json.loads(line) for line in lines.read_text().splitlines()]
-    return score(records, *truth_of(bag))
+        return [json.loads(line) for line in lines.read_text().splitlines()]
 
 
 def main() -> None:
@@ -125,14 +152,32 @@ def main() -> None:
     kinds = ('none', 'good', 'reversed', 'late', 'offset')
     parser.add_argument('--imu', choices=kinds, default='none')
     parser.add_argument('--mode', choices=MODES, default='full')
-    parser.add_argument('--live', action='store_true', help='without looking ahead')
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument('--live', action='store_true', help='through the live node')
+    how.add_argument('--no-ahead', action='store_true', help='replay that knows no next frame')
     args = parser.parse_args()
-    spoil(args.imu)
+    estimates: Callable[[Path, str], list[Record]] = replayed
     if args.live:
+        from lockstep import live  # needs ROS
+
+        if args.imu not in ('none', 'good'):
+            parser.error('the live node is given a good gyro or none')
+        estimates = partial(live, imu=args.imu == 'good')
+    spoil(args.imu)
+    if args.no_ahead:
         look_ahead_no_more()
     print('| stream | exposure | angular | linear | sign % | told % |\n|---|---|---|---|---|---|')
+    errors: list[float] = []
     for bag in sorted(path for path in args.folder.iterdir() if not path.name.startswith('.')):
-        print(f'| {bag.name} {measured(bag, args.mode)}', flush=True)
+        records, (twists, exposures) = estimates(bag, args.mode), truth_of(bag)
+        if '-' in bag.name:
+            print(f'| {bag.name} {right_again(records, twists)}', flush=True)
+        else:
+            found = score(records, twists, exposures)
+            errors += found.errors
+            print(f'| {bag.name} {found}', flush=True)
+    if errors:
+        print(f'exposure of all frames: {100 * np.median(errors):.1f} % (median)')
 
 
 if __name__ == '__main__':

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from depth_deblur_ros.bag import BagWriter
-from depth_deblur_ros.core.data import CameraIntrinsics
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.messages import camera_info_fields, header_fields
 from make_sample_bag import FRAME_ID, picture_fields, START_NS, twist_fields
 import numpy as np
@@ -91,8 +91,34 @@ def write_gyro(bag: BagWriter, path: Trajectory, until: float) -> None:
         bag.write('/imu/data', 'sensor_msgs/msg/Imu', fields, stamp_of(time))
 
 
-def write_frame(bag: BagWriter, stream: Stream, scene: Scene, number: int) -> None:
-    """Render one frame and write its messages."""
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One frame as the sensors give it, and what is true of it."""
+
+    stamp_ns: int  # mid-exposure
+    colour: npt.NDArray[np.uint8]  # (H, W, 3) RGB
+    depth: npt.NDArray[np.uint16]  # (H, W), millimetres, 0 = hole
+    motion: Motion
+    exposure: float  # s
+
+
+def write_shot(bag: BagWriter, shot: Shot) -> None:
+    """Write the messages of one frame."""
+    header = header_fields(shot.stamp_ns, FRAME_ID)
+    for topic, kind, fields in (
+        ('/camera/rgb/camera_info', 'CameraInfo', camera_info_fields(CAMERA, header)),
+        ('/camera/rgb/image_color', 'Image', picture_fields(shot.colour, 'rgb8', header)),
+        ('/camera/depth/image', 'Image', picture_fields(shot.depth, '16UC1', header)),
+    ):
+        bag.write(topic, f'sensor_msgs/msg/{kind}', fields, shot.stamp_ns)
+    twist = {'header': header, 'twist': twist_fields(shot.motion, shot.exposure)}
+    bag.write('/ground_truth/motion', 'geometry_msgs/msg/TwistStamped', twist, shot.stamp_ns)
+    told = {'data': shot.exposure}
+    bag.write('/ground_truth/exposure', 'std_msgs/msg/Float32', told, shot.stamp_ns)
+
+
+def rendered(stream: Stream, scene: Scene, number: int) -> Shot:
+    """Render one frame."""
     rng = np.random.default_rng([0, number])
     middle, exposure = number / RATE, stream.exposure(number)
     pose = stream.path.pose(middle)
@@ -100,17 +126,7 @@ def write_frame(bag: BagWriter, stream: Stream, scene: Scene, number: int) -> No
     colour = photograph(light, rng)
     depth = depth_picture(scene.depth(CAMERA, pose), scene.light(CAMERA, pose), rng)
     motion = true_motion(stream.path, middle, exposure)
-    header = header_fields(stamp_of(middle), FRAME_ID)
-    for topic, kind, fields in (
-        ('/camera/rgb/camera_info', 'CameraInfo', camera_info_fields(CAMERA, header)),
-        ('/camera/rgb/image_color', 'Image', picture_fields(colour, 'rgb8', header)),
-        ('/camera/depth/image', 'Image', picture_fields(depth, '16UC1', header)),
-    ):
-        bag.write(topic, f'sensor_msgs/msg/{kind}', fields, stamp_of(middle))
-    twist = {'header': header, 'twist': twist_fields(motion, exposure)}
-    bag.write('/ground_truth/motion', 'geometry_msgs/msg/TwistStamped', twist, stamp_of(middle))
-    told = {'data': exposure}
-    bag.write('/ground_truth/exposure', 'std_msgs/msg/Float32', told, stamp_of(middle))
+    return Shot(stamp_of(middle), colour, depth, motion, exposure)
 
 
 def main() -> None:
@@ -122,13 +138,15 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0, help='of other rooms and paths')
     args = parser.parse_args()
     known = streams(args.seed)
+    for name in set(args.names) - set(known):
+        parser.error(f'{name} is none of {", ".join(known)}')
     for name in args.names or known:
         stream = known[name]
         scene = make_scene(stream.scene_seed)
         with BagWriter(args.folder / name) as bag:
             write_gyro(bag, stream.path, args.frames / RATE)
             for number in range(args.frames):
-                write_frame(bag, stream, scene, number)
+                write_shot(bag, rendered(stream, scene, number))
         print(f'{args.folder / name}: {args.frames} frames')
 
 

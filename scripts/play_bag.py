@@ -33,7 +33,7 @@ REMAP = {
     'exposure': '/camera/rgb/exposure',
 }
 PATIENCE_S = 60.0
-_STAMP = struct.Struct('<iI')  # begins every message with a header, after four bytes of CDR
+STAMP = struct.Struct('<iI')  # begins every message with a header, after four bytes of CDR
 
 
 def bag_frames(bag: Path = BAG) -> list[list[tuple[str, bytearray]]]:
@@ -68,7 +68,7 @@ def play(node: Any, frames: int, rate: float, bag: Path = BAG) -> list[int]:
         stamps.append(time.time_ns())
         for topic, data in source[number % len(source)]:
             if KINDS[topic] is not Float32:
-                _STAMP.pack_into(data, 4, *divmod(stamps[-1], 1_000_000_000))
+                STAMP.pack_into(data, 4, *divmod(stamps[-1], 1_000_000_000))
             publishers[topic].publish(bytes(data))
     time.sleep(1.0)  # for the last message to arrive
     return stamps

@@ -75,7 +75,7 @@ def _message(topic: str, data: bytearray, stamp: int, rng: random.Random) -> Any
     kind = play_bag.KINDS[topic]
     if kind is play_bag.Float32:
         return bytes(data)
-    play_bag._STAMP.pack_into(data, 4, *divmod(stamp, 1_000_000_000))
+    play_bag.STAMP.pack_into(data, 4, *divmod(stamp, 1_000_000_000))
     return broken(bytes(data), rng) if kind is Image and rng.random() < 0.01 else bytes(data)
 
 
