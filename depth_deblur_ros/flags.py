@@ -21,11 +21,18 @@ TRUTHS = {'true': True, 'false': False}
 
 
 class Parser(argparse.ArgumentParser):
-    """Say what is wrong in one line, as for every other bad input."""
+    """Say what is wrong in one line, as for every other bad input; show usage in one, too."""
 
     def error(self, message: str) -> NoReturn:
         """Refuse the line; --help tells the rest."""
         raise InputError(f'{message} (see {self.prog} --help)')
+
+    def format_help(self) -> str:
+        """Begin with what is needed alone: every flag stands in the list below it."""
+        needed = self._get_formatter()
+        needed.add_usage(None, [action for action in self._actions if action.required], [], '')
+        self.usage = f'{needed.format_help().strip()} [options]'
+        return super().format_help()
 
 
 class _RosYaml(yaml.SafeLoader):

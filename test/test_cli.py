@@ -67,7 +67,8 @@ assert not {{'numba', 'scipy', 'rosbags', 'cv2'}} & set(sys.modules)
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert 'usage: depth-deblur' in done.stdout
+    assert done.stdout.startswith('usage: depth-deblur')
+    assert done.stdout.splitlines()[0].endswith(' [options]')
 
 
 def test_the_module_runs_as_a_program():
