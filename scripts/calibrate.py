@@ -2,10 +2,10 @@
 Ask whether the covariance of the motion is right, on rendered frames with known motion.
 
 usage: python scripts/calibrate.py [--frames N] [--first N] [--modes MODE ...] [--workers N]
-       [--keep FILE.jsonl] [--plot FILE.svg] [--worst FOLDER]
+       [--blurs LOW HIGH] [--vga] [--keep FILE.jsonl] [--plot FILE.svg] [--worst FOLDER]
 
-Rooms, paths and blurs (2 to 40 px) are drawn anew for each frame, from numbers that nothing else
-in the project uses; the solver's constants were set on some of the first 300, so --first 300 asks
+Rooms, paths and blurs (2 to 40 px on 320x240) are drawn anew, from numbers that nothing else in
+the project uses; the solver's constants were set on some of the first 300, so --first 300 asks
 frames that are new to it. Prints, for each mode and axis of the motion, how many of the true
 motions lie within one and three standard deviations of what was solved, but for the sign; the
 plot tells it for all numbers of deviations. --worst draws the five frames with the worst flow;
@@ -15,10 +15,10 @@ with --keep a run that was ended goes on where it was.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 import json
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from depth_deblur_ros.folders import write_image
 from draw_worst import both_ways
 import numpy as np
 import numpy.typing as npt
-from scene import make_scene
+from scene import make_scene, Scene
 from scipy.stats import norm
 from sensor import depth_picture, photograph
 from shake import hand_held, render_blurred, true_motion
@@ -63,24 +63,34 @@ class Shot:
     blur: float
 
 
-def take(number: int) -> Shot:
-    """Render a frame."""
+@lru_cache(maxsize=1)
+def room(number: int) -> Scene:
+    """Furnish a room, which ten frames share."""
+    return make_scene(FIRST_ROOM + number)
+
+
+def take(
+    number: int,
+    blurs: tuple[float, float] = BLURS,
+    camera: CameraIntrinsics = CAMERA,
+) -> Shot:
+    """Render a frame with a mean blur between two lengths [px]."""
     rng = np.random.default_rng([FIRST_PATH, number])
-    scene = make_scene(FIRST_ROOM + number // PER_ROOM)
+    scene = room(number // PER_ROOM)
     middle, exposure = rng.uniform(0, 10), rng.uniform(*EXPOSURES)
     speeds = np.array([rng.uniform(0.3, 1.5), rng.uniform(0.1, 0.8)])
-    wanted = np.exp(rng.uniform(*np.log(BLURS)))
+    wanted = np.exp(rng.uniform(*np.log(blurs)))
     for _ in range(2):  # the second time as fast as makes that blur
         path = hand_held(FIRST_PATH + number, *speeds)
         pose, motion = path.pose(middle), true_motion(path, middle, exposure)
-        view = scene.depth(CAMERA, pose)
-        length = blur_length(motion.vector, view.depth, CAMERA)
+        view = scene.depth(camera, pose)
+        length = blur_length(motion.vector, view.depth, camera)
         speeds *= min(wanted / length, FASTEST)
-    light = render_blurred(scene, CAMERA, path, middle, exposure, least=LEAST_VIEWS)
+    light = render_blurred(scene, camera, path, middle, exposure, least=LEAST_VIEWS)
     colour = (photograph(light, rng) / 255).astype(np.float32)
-    depth = depth_picture(view, scene.light(CAMERA, pose), rng).astype(np.float32) / 1000
+    depth = depth_picture(view, scene.light(camera, pose), rng).astype(np.float32) / 1000
     depth[depth == 0] = np.nan
-    return Shot(RgbdFrame(colour, depth, CAMERA), motion, length)
+    return Shot(RgbdFrame(colour, depth, camera), motion, length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +104,22 @@ class Answer:
     miss: float = 0.0
 
 
+Shoot = Callable[[int], Shot]
+
+
 def deviations(shot: Shot, result: DeblurResult) -> tuple[Array, float]:
     """Give the error of each axis (6,) in standard deviations, and of the flow [px]."""
-    found, true, depth = result.motion, shot.motion.vector, result.depth
-    misses = [blur_length(found.vector - s * true, depth, CAMERA) for s in (1, -1)]
+    found, true, camera = result.motion, shot.motion.vector, shot.frame.camera
+    misses = [blur_length(found.vector - s * true, result.depth, camera) for s in (1, -1)]
     sign = 1 if misses[0] <= misses[1] else -1
     assert found.covariance is not None
     spread = np.sqrt(np.diag(found.covariance))
     return np.asarray((found.vector - sign * true) / spread), min(misses)
 
 
-def asked(number: int, modes: Sequence[str]) -> list[Answer]:
+def asked(number: int, shoot: Shoot, modes: Sequence[str]) -> list[Answer]:
     """Render a frame and solve it in each mode."""
-    shot, answers = take(number), []
+    shot, answers = shoot(number), []
     for mode in modes:
         # The image does not count here.
         result = deblur(shot.frame, SolverParams(mode=mode, threads=1, reweightings=1, cg_steps=1))
@@ -118,13 +131,14 @@ def asked(number: int, modes: Sequence[str]) -> list[Answer]:
     return answers
 
 
-def all_asked(numbers: Sequence[int], args: argparse.Namespace) -> Iterator[list[Answer]]:
+def all_asked(
+    numbers: Sequence[int], work: Callable[[int], list[Answer]], workers: int
+) -> Iterator[list[Answer]]:
     """Ask frame after frame, in so many processes."""
-    work = partial(asked, modes=args.modes)
-    if args.workers == 1:
+    if workers == 1:
         yield from map(work, numbers)
         return
-    with ProcessPoolExecutor(args.workers) as pool:
+    with ProcessPoolExecutor(workers) as pool:
         yield from pool.map(work, numbers)
 
 
@@ -155,9 +169,13 @@ def printed(mode: str, answers: Sequence[Answer]) -> None:
         print(f'{name:8s} within 1 sigma {within[0]:5.1f} %, within 3 sigma {within[1]:5.1f} %')
 
 
-def plotted(errors: dict[str, Array]) -> str:
-    """Draw the share of errors (n, 6) within so many deviations, as it is and as it should be."""
+def plotted(columns: dict[str, tuple[Answer, ...]]) -> str:
+    """Draw the share of errors within so many deviations, as it is and as it should be."""
     at = np.linspace(0, 4, 81)
+    errors = {
+        mode: np.array([answer.error for answer in answers if answer.error is not None])
+        for mode, answers in columns.items()
+    }
     panels = []
     for k, name in enumerate(AXES):
         curves = [
@@ -171,12 +189,28 @@ def plotted(errors: dict[str, Array]) -> str:
     return chart(panels, 3, title)
 
 
-def draw_worst(answers: Sequence[Answer], folder: Path) -> None:
+def draw_worst(answers: Sequence[Answer], shoot: Shoot, folder: Path) -> None:
     """Draw the frames whose flow is most wrong, and with their true motion."""
     worst = sorted(answers, key=lambda answer: answer.miss, reverse=True)[:WORST]
     for answer in worst:
-        shot = take(answer.number)
+        shot = shoot(answer.number)
         write_image(folder / f'{answer.number}.jpg', both_ways(shot.frame, shot.motion))
+
+
+def gathered(args: argparse.Namespace, shoot: Shoot) -> dict[str, tuple[Answer, ...]]:
+    """Ask all frames that were not asked before, and keep what they say; by mode."""
+    numbers = range(args.first, args.first + args.frames)
+    kept = read_kept(args.keep, args.modes) if args.keep else {}
+    missing = [number for number in numbers if number not in kept]
+    work = partial(asked, shoot=shoot, modes=args.modes)
+    for number, answers in zip(missing, all_asked(missing, work, args.workers), strict=True):
+        kept[number] = answers
+        if args.keep:
+            record = dict(zip(args.modes, map(asdict, answers), strict=True))
+            with args.keep.open('a') as file:
+                file.write(json.dumps(record) + '\n')
+    rows = [kept[number] for number in numbers]
+    return dict(zip(args.modes, zip(*rows, strict=True), strict=True))
 
 
 def main() -> None:
@@ -186,32 +220,21 @@ def main() -> None:
     parser.add_argument('--first', type=int, default=0)
     parser.add_argument('--modes', nargs='+', choices=MODES, default=['full', 'motion'])
     parser.add_argument('--workers', type=int, default=1)
+    parser.add_argument('--blurs', nargs=2, type=float, default=BLURS)
+    parser.add_argument('--vga', action='store_true')
     parser.add_argument('--keep', type=Path)
     parser.add_argument('--plot', type=Path)
     parser.add_argument('--worst', type=Path)
     args = parser.parse_args()
-    numbers = range(args.first, args.first + args.frames)
-    kept = read_kept(args.keep, args.modes) if args.keep else {}
-    missing = [number for number in numbers if number not in kept]
-    for number, answers in zip(missing, all_asked(missing, args), strict=True):
-        kept[number] = answers
-        if args.keep:
-            with args.keep.open('a') as file:
-                file.write(
-                    json.dumps(dict(zip(args.modes, map(asdict, answers), strict=True))) + '\n'
-                )
-    rows = [kept[number] for number in numbers]
-    columns = dict(zip(args.modes, zip(*rows, strict=True), strict=True))
+    camera = CAMERA.scaled(640, 480) if args.vga else CAMERA
+    shoot = partial(take, blurs=tuple(args.blurs), camera=camera)
+    columns = gathered(args, shoot)
     for mode, answers in columns.items():
         printed(mode, answers)
     if args.plot:
-        errors = {
-            mode: np.array([a.error for a in answers if a.error is not None])
-            for mode, answers in columns.items()
-        }
-        args.plot.write_text(plotted(errors))
+        args.plot.write_text(plotted(columns))
     if args.worst:
-        draw_worst(columns[args.modes[0]], args.worst)
+        draw_worst(columns[args.modes[0]], shoot, args.worst)
 
 
 if __name__ == '__main__':

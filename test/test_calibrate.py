@@ -49,7 +49,7 @@ def test_the_tables_count_what_each_mode_said(shot, tmp_path, monkeypatch, capsy
         off = 1.05 if params.mode == 'full' else 1.2
         return found(Motion.from_vector(off * truth, spread))
 
-    monkeypatch.setattr(calibrate, 'take', lambda number: shot)
+    monkeypatch.setattr(calibrate, 'take', lambda number, blurs, camera: shot)
     monkeypatch.setattr(calibrate, 'deblur', solved)
     plot, keep = tmp_path / 'plot.svg', tmp_path / 'kept.jsonl'
     line = ['calibrate.py', '--frames', '2', '--plot', str(plot), '--keep', str(keep)]
