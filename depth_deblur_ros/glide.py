@@ -21,6 +21,7 @@ RESTLESS = np.array([16.0, 5.0])  # rad/s^2, m/s^2; of a hand that shakes
 CALMEST, WILDEST = RESTLESS / 2, 4 * RESTLESS
 CALM_DOWN, STIR_UP = 0.1, 0.3  # powers of how far a way missed the expected one
 FAST = np.repeat([3.0, 1.5], 3)  # rad/s, m/s; what a velocity may be before anything is seen
+JUMP = 9.0  # times the expected squared miss, beyond which a velocity has jumped
 ENDS = np.r_[:6, 18:24]  # what a way shows of (c, u, a, b)
 POINTS = 16  # of the integral for the noise
 
@@ -57,6 +58,11 @@ class Glide:
         """Give the covariance (6, 6) of u."""
         return self.covariance[:6, :6]
 
+    @property
+    def known(self) -> bool:
+        """Tell whether anything was seen of the velocity yet."""
+        return bool(self.spread[0, 0] < FAST[0] ** 2)
+
     def measured(self, velocity: Vector, covariance: Vector, look: Vector | None = None) -> Glide:
         """Take in a measured velocity (6,), look (6, 12) @ (u, a), with its covariance (6, 6)."""
         look = np.eye(6, 12) if look is None else look
@@ -78,7 +84,10 @@ class Glide:
             miss, expected = way.motion - look @ mean, look @ seen + way.covariance
             off = float(miss @ np.linalg.solve(expected, miss))
             likely = -(off + float(np.linalg.slogdet(expected)[1])) / 2
-            unrest = _stirred(unrest, miss, expected)
+            missed = _missed(miss, expected)
+            if self.known and missed.max() > JUMP:
+                return unknown_glide().foreseen(seconds, way)[0], likely
+            unrest = _stirred(unrest, missed)
             gain = seen @ np.linalg.inv(expected)
             mean, spread = mean + gain @ miss, spread - gain @ seen.T
         return Glide(mean[6:18], _even(spread[6:18, 6:18]), unrest), likely
@@ -103,11 +112,15 @@ def unknown_glide() -> Glide:
     return Glide(np.zeros(12), np.diag(spread**2), RESTLESS)
 
 
-def _stirred(unrest: Vector, miss: Vector, expected: Vector) -> Vector:
-    """Fit the unrest to how far turn and shift missed what was expected, (45)."""
+def _missed(miss: Vector, expected: Vector) -> Vector:
+    """Give how far turn and shift missed what was expected, (2,) mean squared, 1 as expected."""
     parts = (slice(0, 3), slice(3, 6))
-    off = [miss[k] @ np.linalg.solve(expected[k, k], miss[k]) / 3 for k in parts]
-    ratio = np.clip(off, 0.1, 25)
+    return np.array([miss[k] @ np.linalg.solve(expected[k, k], miss[k]) / 3 for k in parts])
+
+
+def _stirred(unrest: Vector, missed: Vector) -> Vector:
+    """Fit the unrest to how far turn and shift missed what was expected, (45)."""
+    ratio = np.clip(missed, 0.1, 25)
     power = np.where(ratio > 1, STIR_UP, CALM_DOWN)
     return np.asarray(np.clip(unrest * ratio**power, CALMEST, WILDEST))
 

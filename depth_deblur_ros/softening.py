@@ -71,7 +71,8 @@ def exposure_from_softness(
     along = [(j[inside] @ u) @ _F for u in velocities]
     straight = np.maximum(*np.abs(along)) * longest < STRAIGHT
     bend = -(math.pi**2) / 3 * (np.square(along[0]) - np.square(along[1]))
-    return _fitted(log, bend, weight * straight, known)
+    found = _fitted(log, bend, weight * straight, known)
+    return found if found and found.seconds < longest else None
 
 
 def _power(view: View, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Vector:
@@ -110,8 +111,8 @@ def _exposure(square: float, spread: float, known: Exposure | None) -> Exposure 
     """Give T of T^2 and its standard deviation, which noise may have made negative."""
     expected = known.seconds if known and known.doubt < UNKNOWN else 0.0
     doubt = math.hypot(INEXACT, spread / 2 / max(square, expected**2, TINY))
-    if doubt > VAGUE:
+    if doubt > VAGUE or (square <= 0 and not expected):
         return None
-    if square > expected**2 or not expected:
-        return Exposure(math.sqrt(square), doubt) if square > 0 else None
+    if square > expected**2:
+        return Exposure(math.sqrt(square), doubt)
     return Exposure(max((expected**2 + square) / (2 * expected), expected / 4), doubt)

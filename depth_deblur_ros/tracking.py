@@ -28,7 +28,7 @@ from depth_deblur_ros.core.solver import deblur, restore_known
 from depth_deblur_ros.glide import Glide, unknown_glide, Way
 from depth_deblur_ros.gyro import Gyro
 from depth_deblur_ros.habits import Habits
-from depth_deblur_ros.joining import Context, GUESS, join, Joined
+from depth_deblur_ros.joining import Context, GUESS, join, Joined, LONGEST
 from depth_deblur_ros.shutter import Exposure, Shutter
 from depth_deblur_ros.softening import exposure_from_softness
 import numpy as np
@@ -155,9 +155,13 @@ class Tracker:
         if last is None or seen.between is None:
             return
         then = glide.before(*self._way(seen.between, self._cadence)).velocity
-        views, way, usual = (last.view, seen.view), seen.between.motion, self._cadence.usual
+        views, way, longest = (
+            (last.view, seen.view),
+            seen.between.motion,
+            LONGEST * self._cadence.usual,
+        )
         known = self._shutter.exposure
-        found = exposure_from_softness(views, way, (then, now), known, usual)
+        found = exposure_from_softness(views, way, (then, now), known, longest)
         if found:
             self._shutter = self._shutter.measured(found)[0]
 

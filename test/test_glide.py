@@ -89,3 +89,16 @@ def test_the_likelier_way_is_the_one_that_was_foreseen():
         glide = glide.moved(0.033, gone(0.033 * U))
     right, wrong = (glide.foreseen(0.033, gone(0.033 * u))[1] for u in (U, 2 * U))
     assert right > wrong + 5
+
+
+@pytest.mark.parametrize('speed', [-1.0, 0.0, 2.0])
+def test_a_velocity_that_jumps_leaves_no_swing(speed):
+    doubt = Way(0.033 * U, 1e-7 * np.eye(6), np.eye(6, 12))
+    glide = unknown_glide()
+    for _ in range(20):
+        glide = glide.moved(0.033, doubt)
+    off = []
+    for _ in range(4):
+        glide = glide.moved(0.033, Way(0.033 * speed * U, doubt.covariance, doubt.look))
+        off.append(np.linalg.norm(glide.velocity - speed * U) / np.linalg.norm(U))
+    assert max(off[1:]) < 0.15, off

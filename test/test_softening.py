@@ -70,3 +70,9 @@ def test_without_depth_or_overlap_there_is_no_answer():
         assert exposure_from_softness(views, motion(way), velocities, None, INTERVAL) is None
     flat = View(np.full(DEPTH.shape, 90, np.uint8), DEPTH, CAMERA)
     assert exposure_from_softness((flat, flat), motion(1), velocities, None, INTERVAL) is None
+
+
+def test_no_exposure_is_longer_than_it_can_be():
+    views = [view(0, 30), view(1.5, 90)]
+    slow = [motion(0.3), motion(0.9)]  # as a camera that starts again looks at first
+    assert exposure_from_softness(views, motion(1.5), slow, None, INTERVAL) is None
