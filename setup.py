@@ -30,6 +30,7 @@ setup(
                 'config/fastdds.xml',
                 'config/foxglove.json',
                 'config/paper.yaml',
+                'config/robot_localization.yaml',
                 'config/sros2_policy.xml',
                 'config/view.rviz',
             ],
