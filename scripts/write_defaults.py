@@ -43,7 +43,11 @@ MODES = {  # the motion, the image, what for
         'all rounds of the image step (`reweightings`, `cg_steps`)',
         'pictures, data sets, SLAM after the fact',
     ),
-    'fast': ('found', 'fewer rounds: softer where the blur is long', 'live'),
+    'fast': (
+        'found; that of the first frame refined',
+        'fewer rounds: softer where the blur is long',
+        'live',
+    ),
     'motion': ('found', 'left as it is', 'odometry: costs the search alone'),
 }
 TUM = {

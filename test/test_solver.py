@@ -227,7 +227,16 @@ def test_a_grey_frame_is_solved_as_its_colour_twin(small_frame, small_result):
 def test_the_motion_alone_leaves_the_image(small_frame):
     result = deblur(small_frame, SolverParams(mode='motion'))
     np.testing.assert_array_equal(result.image, small_frame.image)
-    same(result, deblur(small_frame, SolverParams(mode='fast')), but=('seconds', 'image'))
+
+
+def test_where_neighbours_tell_what_to_expect_fast_finds_what_motion_finds(small_frame):
+    before = deblur(small_frame, SolverParams(mode='motion')).motion
+    alone = deblur(small_frame, SolverParams(mode='fast'))
+    motion, fast = (
+        deblur(small_frame, SolverParams(mode=mode), start=before) for mode in ('motion', 'fast')
+    )
+    same(motion, fast, but=('seconds', 'image'))
+    assert not np.array_equal(alone.motion.vector, fast.motion.vector)  # that is refined
 
 
 def test_fast_improves_the_image(small_frame):

@@ -31,11 +31,11 @@ import numpy as np
 
 Result = TypeVar('Result')
 
-READABLE = 24.0  # px; longer blurs are refined at half the size, or less
-BUDGET = 80_000  # px that are looked at: more of them hardly change the motion
+READABLE = 50.0  # px; longer blurs are refined at half the size, or less
+AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
-MOVES = 4
+MOVES = 2  # from the start; more gain nothing
 LONGEST_MOVE, LEAST_MOVE = 1.0, 0.02  # px
 SOFTEST, DISSENT = (
     10.0,
@@ -45,12 +45,17 @@ BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 
 
 def refine(
-    light: FloatImage, depth: FloatImage, camera: CameraIntrinsics, start: Motion
+    light: FloatImage,
+    depth: FloatImage,
+    camera: CameraIntrinsics,
+    start: Motion,
+    budget: int,
 ) -> Motion:
     """
     Give the motion, with its covariance, that makes blurred grey light (H, W) likeliest.
 
-    depth (H, W) filled [m]; start: from the spectra, with its covariance, which takes part.
+    depth (H, W) filled [m]; start: from the spectra, with its covariance, which takes part;
+    budget: px that are looked at.
     """
     assert start.covariance is not None
 
@@ -58,7 +63,7 @@ def refine(
         return blur_length(p, depth, camera)
 
     certainty = np.asarray(np.linalg.inv(start.covariance), np.float64)
-    parts = _parts(light, depth, camera, length(start.vector))
+    parts = _parts(light, depth, camera, length(start.vector), budget)
     parts = _each(lambda part: settled(part, start.vector), parts)
     return _moved(parts, start.vector, certainty, length)
 
@@ -129,7 +134,7 @@ def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
 
 
 def _parts(
-    light: FloatImage, depth: FloatImage, camera: CameraIntrinsics, length: float
+    light: FloatImage, depth: FloatImage, camera: CameraIntrinsics, length: float, budget: int
 ) -> list[Part]:
     """Choose one part of each quarter, the most textured, at a size where the blur is READABLE."""
     factor = 1
@@ -141,7 +146,8 @@ def _parts(
         depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
         camera = camera.scaled(*size)
     height, width = (side // 2 for side in light.shape)
-    share = min(1.0, math.sqrt(BUDGET / light.size))
+    pixels = budget * min(1.0, AFFORDABLE * factor / length)
+    share = min(1.0, math.sqrt(pixels / light.size))
     rows, columns = int(height * share), int(width * share)
     parts = []
     for k in range(4):

@@ -4,7 +4,8 @@ The page that tells the algorithm: from one blurred RGB-D frame to the sharp ima
 1 fill the depth map's holes, guided by the colours (depth.py)
 2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or
   find that there is no blur or nothing to trust: then the frame passes unchanged
-3 in mode full, move on to where the image itself is likeliest (joint.py)
+3 move on to where the image itself is likeliest (joint.py): in mode full, and at the first frame
+  in mode fast
 4 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
 
 With `method` paper, 2 to 4 are the paper's: alternation.py.
@@ -39,6 +40,7 @@ import numba
 import numpy as np
 
 FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
+FULL_BUDGET, FAST_BUDGET = 200_000, 80_000  # px that the joint refinement looks at
 
 
 def deblur(
@@ -62,16 +64,24 @@ def deblur(
             return replace(result, energies=energies)
         found = blind_start(_grey(frame.image), depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
-            found = replace(found, motion=_settled(frame, depth, found, params))
+            budget = _budget(params.mode, known=start is not None)
+            found = replace(found, motion=_settled(frame, depth, found, budget))
         return _finish(frame, depth, found, params, began)
 
 
-def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, params: SolverParams) -> Motion:
-    """Refine the motion in mode full; in each mode its covariance is as large as errors are."""
-    if params.mode != 'full':
+def _budget(mode: str, *, known: bool) -> int:
+    """Say how many pixels the joint refinement looks at; known: what about to expect."""
+    if mode == 'full':
+        return FULL_BUDGET
+    return FAST_BUDGET if mode == 'fast' and not known else 0
+
+
+def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, budget: int) -> Motion:
+    """Refine the motion, if there is a budget, and tell a covariance as large as errors are."""
+    if not budget:
         return calibrated(found.motion, found.axes, OF_SPECTRA)
     light = _grey(light_from_stored(frame.image, frame.camera.transfer))
-    motion = refine(light, depth, frame.camera, found.motion)
+    motion = refine(light, depth, frame.camera, found.motion, budget)
     return calibrated(motion, found.axes, OF_LIKELIHOOD)
 
 
