@@ -1,10 +1,11 @@
 """The same stream through the live node, over real DDS, and through replay: the same motion."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 import sys
 
-from depth_deblur_ros.bag import BagWriter
+from depth_deblur_ros.bag import BagReader, BagWriter, decoded
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.messages import (
     camera_info_fields,
@@ -28,11 +29,11 @@ FRAMES = 12
 KINDS = {COLOUR: Image, DEPTH: Image, INFO: CameraInfo}
 
 
-def messages(number):
+def messages(number, camera=CAMERA):
     """Give topic and fields of the messages of a frame."""
     made = frame(number)
     header = header_fields(made.stamp_ns, 'camera_optical_frame')
-    yield INFO, camera_info_fields(CAMERA, header)
+    yield INFO, camera_info_fields(camera, header)
     yield COLOUR, image_fields(made.image, header)
     yield DEPTH, depth_fields(made.depth, header)
 
@@ -88,3 +89,27 @@ def test_live_and_replay_tell_the_same_motion(peer, tmp_path):
         truth = -rate((stamp - START_NS) / 1e9)
         for found in (told[stamp], told_live[stamp]):
             assert np.linalg.norm(found - truth) < 0.3 * np.linalg.norm(truth)
+
+
+def test_a_lens_is_undone_live_as_in_replay(peer, tmp_path):
+    sent = list(messages(0, replace(CAMERA, distortion=(0.3, -0.1, 0.0, 0.0, 0.0))))
+    node = Process((*NODE, '--ros-args', '-p', 'rectified:=false'), tmp_path / 'log')
+    pictures = peer.listen(Image, 'deblurred/image')
+    infos = peer.listen(CameraInfo, 'deblurred/camera_info')
+    try:
+        peer.advertise(KINDS)
+        for topic, fields in sent:
+            peer.send(topic, KINDS[topic], filled(KINDS[topic](), fields))
+        peer.until(lambda: pictures and infos)
+    finally:
+        node.stop()
+    with BagWriter(tmp_path / 'in') as bag:
+        for topic, fields in sent:
+            kind = f'sensor_msgs/msg/{KINDS[topic].__name__}'
+            bag.write(f'/{topic}', kind, fields, frame(0).stamp_ns)
+    params = SolverParams(mode='motion', rectified=False)
+    replay(tmp_path / 'in', tmp_path / 'out', params=params, solve=Knowing())
+    with BagReader(tmp_path / 'out') as reader:
+        (written,) = map(decoded, reader.messages({'/deblurred/image'}))
+    assert bytes(pictures[0].data) == bytes(written.data) != bytes(sent[1][1]['data'])
+    assert not any(infos[0].d)
