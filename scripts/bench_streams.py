@@ -21,7 +21,7 @@ import tempfile
 from types import SimpleNamespace
 from typing import Any
 
-from break_streams import AFTER
+from break_streams import AFTER, KINDS
 from depth_deblur_ros import replay as replaying
 from depth_deblur_ros.bag import BagReader, decoded
 from depth_deblur_ros.core.params import MODES, SolverParams
@@ -170,7 +170,7 @@ def main() -> None:
     errors: list[float] = []
     for bag in sorted(path for path in args.folder.iterdir() if not path.name.startswith('.')):
         records, (twists, exposures) = estimates(bag, args.mode), truth_of(bag)
-        if '-' in bag.name:
+        if bag.name.partition('-')[2] in KINDS:
             print(f'| {bag.name} {right_again(records, twists)}', flush=True)
         else:
             found = score(records, twists, exposures)

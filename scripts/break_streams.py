@@ -5,7 +5,8 @@ usage: python scripts/break_streams.py STREAMS OUT [--kinds KIND ...] [--seed N]
 
 gap: the second is missing. back: then come frames that are a second older. static: the camera
 stands still. dark: a black picture without depth. hidden: a picture of one colour, with depth.
-The last AFTER frames of each bag are those after the break.
+The last AFTER frames of each bag are those after the break. plain is no break: the whole stream
+with pictures of one colour, with the depth and the gyro that it has.
 """
 
 from __future__ import annotations
@@ -16,17 +17,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from depth_deblur_ros.bag import BagReader, BagWriter
+from depth_deblur_ros.bag import BagReader, BagWriter, decoded
 from depth_deblur_ros.core.data import Motion
 from depth_deblur_ros.mcap_file import BagMessage
-from make_streams import CAMERA, RATE, Shot, stamp_of, Stream, streams, write_shot
+from make_streams import CAMERA, RATE, Shot, stamp_of, Stream, streams, write_gyro, write_shot
 import numpy as np
 from play_bag import STAMP
 from scene import make_scene
 from sensor import depth_picture, photograph
+from shake import true_motion
 
 BEFORE, BREAK, AFTER = 20, 30, 10  # frames
 KINDS = ('gap', 'back', 'static', 'dark', 'hidden')
+PLAIN = 'plain'
 GREY = 0.2  # light of what covers the lens in one colour
 WITHOUT_HEADER = '/ground_truth/exposure'
 Frame = list[BagMessage]
@@ -76,8 +79,29 @@ def standing(source: Source, kind: str) -> Iterator[Shot]:
         )
 
 
+def write_plain(bag: BagWriter, source: Source) -> None:
+    """Write the stream as it is where nothing has texture."""
+    stream, grey = source.stream, np.full((CAMERA.height, CAMERA.width, 3), GREY, np.float32)
+    write_gyro(bag, stream.path, len(source.frames) / RATE)
+    for number, frame in enumerate(source.frames):
+        (depth,) = (decoded(m) for m in frame if m.topic.name == '/camera/depth/image')
+        write_shot(
+            bag,
+            Shot(
+                stamp_of(number / RATE),
+                photograph(grey, np.random.default_rng([2, number])),
+                np.frombuffer(bytes(depth.data), np.uint16).reshape(grey.shape[:2]),
+                true_motion(stream.path, number / RATE, stream.exposure(number)),
+                stream.exposure(number),
+            ),
+        )
+
+
 def write_broken(bag: BagWriter, source: Source, kind: str) -> None:
     """Write one broken bag."""
+    if kind == PLAIN:
+        write_plain(bag, source)
+        return
     frames, whole = source.frames, BEFORE + BREAK
     if kind == 'back':
         order = [*range(whole - BEFORE, whole), *range(AFTER)]
@@ -100,7 +124,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description='Break streams off for a second.')
     parser.add_argument('streams', type=Path)
     parser.add_argument('out', type=Path)
-    parser.add_argument('--kinds', nargs='*', choices=KINDS, default=KINDS)
+    parser.add_argument('--kinds', nargs='*', choices=(*KINDS, PLAIN), default=KINDS)
     parser.add_argument('--seed', type=int, default=0, help='that the streams were made with')
     args = parser.parse_args()
     for name, stream in streams(args.seed).items():
