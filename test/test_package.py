@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from zipfile import ZipFile
 
 import pytest
 
@@ -85,6 +86,21 @@ def test_the_node_starts_as_ros2_run_starts_it(clone, colcon, tmp_path, monkeypa
     finally:
         peer.close()
         node.kill()
+
+
+def test_a_wheel_can_be_made_of_the_sdist(clone, tmp_path):
+    make = f"from setuptools import build_meta; build_meta.build_sdist('{tmp_path}')"
+    run(sys.executable, '-c', make, cwd=clone)
+    (sdist,) = tmp_path.glob('*.tar.gz')
+    pip = [sys.executable, '-m', 'pip', '--disable-pip-version-check']
+    run(*pip, 'wheel', '--no-deps', '--no-build-isolation', '-w', tmp_path, sdist)
+    (wheel,) = tmp_path.glob('*.whl')
+    held = {name.partition('/data/')[2] or name for name in ZipFile(wheel).namelist()}
+    config = {str(path.relative_to(clone)) for path in (clone / 'config').rglob('*.*')}
+    share = f'share/{NAME}'
+    assert {f'{share}/package.xml', *(f'{share}/{name}' for name in config)} <= held
+    modules = {str(path.relative_to(clone)) for path in (clone / NAME).rglob('*.py')}
+    assert {f'{NAME}/py.typed', *modules} <= held
 
 
 def test_a_wheel_puts_depth_deblur_on_the_path(clone, tmp_path):
