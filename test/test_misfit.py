@@ -67,7 +67,8 @@ def test_small_and_unchanged_images_have_no_coarse_level_and_no_energy():
     frame, _ = frame_of()
     result = restore_known(frame, MOTION)
     assert energies_of(frame, replace(result, outcome=Outcome.FAILED), 2.7) == ()
-    assert energies_of(frame, replace(result, image=frame.image), 2.7) == ()
+    rounded = np.rint(255 * frame.image).astype(np.float32) / 255  # as a bag keeps it
+    assert energies_of(frame, replace(result, image=rounded), 2.7) == ()
     part = slice(0, 40), slice(0, 40)
     small = replace(
         frame,
