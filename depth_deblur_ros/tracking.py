@@ -155,13 +155,13 @@ class Tracker:
         if last is None or seen.between is None:
             return
         then = glide.before(*self._way(seen.between, self._cadence)).velocity
-        views, way, longest = (
+        found = exposure_from_softness(
             (last.view, seen.view),
             seen.between.motion,
-            LONGEST * self._cadence.usual,
+            (then, now),
+            known=self._shutter.exposure,
+            longest=LONGEST * self._cadence.usual,
         )
-        known = self._shutter.exposure
-        found = exposure_from_softness(views, way, (then, now), known, longest)
         if found:
             self._shutter = self._shutter.measured(found)[0]
 
