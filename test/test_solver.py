@@ -5,6 +5,7 @@ import math
 
 import cv2
 from depth_deblur_ros import bench
+from depth_deblur_ros.core import solver
 from depth_deblur_ros.core.data import (
     CameraIntrinsics,
     InputError,
@@ -307,3 +308,13 @@ def test_still_cases_pass_unchanged(data, tmp_path):
         np.testing.assert_array_equal(
             cv2.imread(str(tmp_path / row.case / 'deblurred.png')), taken
         )
+
+
+def test_a_burnt_channel_has_no_share_of_grey():
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0, 0.9, (48, 64, 3)).astype(np.float32)
+    np.testing.assert_allclose(solver._shares(image), np.full((1, 3), 1 / 3), rtol=1e-6)
+    image[:24, :, 0] = 1
+    np.testing.assert_allclose(solver._shares(image), [[0, 0.5, 0.5]])
+    image[:24] = 1  # all alike
+    np.testing.assert_allclose(solver._shares(image), np.full((1, 3), 1 / 3), rtol=1e-6)

@@ -39,8 +39,10 @@ from depth_deblur_ros.core.trust import calibrated, OF_LIKELIHOOD, OF_SPECTRA
 import numba
 import numpy as np
 
+SATURATED, EVENLY = 0.98, 0.02  # stored values; how many more pixels a channel may have there
+SPARSE = 4  # every so many-th pixel tells that
 FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
-FULL_BUDGET, FAST_BUDGET = 200_000, 80_000  # px that the joint refinement looks at
+FULL_BUDGET, FAST_BUDGET = 200_000, 120_000  # px that the joint refinement looks at
 
 
 def deblur(
@@ -62,7 +64,8 @@ def deblur(
             found, energies = _alternated(frame, depth, params)
             result = _finish(frame, depth, found, params, began)
             return replace(result, energies=energies)
-        found = blind_start(_grey(frame.image), depth, frame.camera, start)
+        grey = _grey(frame.image, _shares(frame.image))
+        found = blind_start(grey, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
             budget = _budget(params.mode, known=start is not None)
             found = replace(found, motion=_settled(frame, depth, found, budget))
@@ -80,7 +83,8 @@ def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, budget: int) -> 
     """Refine the motion, if there is a budget, and tell a covariance as large as errors are."""
     if not budget:
         return calibrated(found.motion, found.axes, OF_SPECTRA)
-    light = _grey(light_from_stored(frame.image, frame.camera.transfer))
+    light = light_from_stored(frame.image, frame.camera.transfer)
+    light = _grey(light, _shares(frame.image))
     motion = refine(light, depth, frame.camera, found.motion, budget)
     return calibrated(motion, found.axes, OF_LIKELIHOOD)
 
@@ -148,10 +152,19 @@ def _colour(image: FloatImage) -> FloatImage:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
 
 
-def _grey(image: FloatImage) -> FloatImage:
+def _grey(image: FloatImage, shares: FloatImage) -> FloatImage:
     if image.ndim == 2:
         return image
-    return np.asarray(cv2.transform(image, np.full((1, 3), 1 / 3, np.float32)), np.float32)
+    return np.asarray(cv2.transform(image, shares), np.float32)
+
+
+def _shares(image: FloatImage) -> FloatImage:
+    """Give the channels' shares of grey (1, 3): a mean of burnt and other channels is no light."""
+    if image.ndim == 2:
+        return np.ones((1, 1), np.float32)
+    burnt = (image[::SPARSE, ::SPARSE] > SATURATED).mean((0, 1))
+    chosen = burnt <= burnt.min() + EVENLY
+    return np.asarray(chosen[None] / chosen.sum(), np.float32)
 
 
 @contextmanager
