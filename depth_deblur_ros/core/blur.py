@@ -160,11 +160,6 @@ def _largest_of_rows(nearness, flow, rows):  # type: ignore[no-untyped-def]
         rows[y, 0], rows[y, 1], rows[y, 2] = px, py, square
 
 
-@njit(cache=True, nogil=True)
-def _instant(i, samples):  # type: ignore[no-untyped-def]
-    return np.float32((i + 0.5) / samples - 0.5)
-
-
 @njit(cache=True, nogil=True, inline='always')
 def _flow_parts(x, y, ray, width, m):  # type: ignore[no-untyped-def]
     """Give a and b of the flow a + w b at a pixel, (3) of docs/method.md."""
