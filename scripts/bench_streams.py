@@ -4,7 +4,8 @@ Measure what tracking tells on the bags of make_streams.py, through replay.
 usage: python scripts/bench_streams.py FOLDER [--imu KIND] [--mode MODE] [--live | --no-ahead]
 
 One line per bag: median error of the exposure; rms error of the angular and the linear velocity
-over that of no motion, frames that tell none counting as such; sign and told in percent. Of a bag
+over that of no motion, frames that tell none counting as such; sign and told in percent; the rms
+errors again over the frames that tell a velocity. Of a bag
 of break_streams.py: the first right frame after the break, and how many of the frames are right.
 Through replay, or with --live through the live node, over DDS.
 """
@@ -16,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 import json
+import math
 from pathlib import Path
 import tempfile
 from types import SimpleNamespace
@@ -33,6 +35,10 @@ TRUTH, TOLD = '/ground_truth/motion', '/ground_truth/exposure'
 LATE_NS = 50_000_000
 RIGHT, SLOW = 0.25, 0.1  # of the velocity; of the usual one, below which an error is none
 AWAY = 2.0  # m; at this depth, a shift counts as much as a turn
+HEAD = (
+    '| stream | exposure | angular | linear | sign % | told % | angular, told | linear, told |\n'
+    '|---|---|---|---|---|---|---|---|'
+)
 Array = npt.NDArray[np.float64]
 Record = dict[str, Any]
 
@@ -46,12 +52,15 @@ class Score:
     shift: float
     sign: float
     told: float
-    errors: tuple[float, ...] = ()  # of each frame's exposure
+    told_turn: float  # of the frames that tell one
+    told_shift: float
+    errors: tuple[float, ...]  # of each frame's exposure
 
     def __str__(self) -> str:
         return (
             f'| {100 * self.exposure:.1f} % | {self.turn:.3f} | {self.shift:.3f} '
-            f'| {100 * self.sign:.0f} | {100 * self.told:.0f} |'
+            f'| {100 * self.sign:.0f} | {100 * self.told:.0f} '
+            f'| {self.told_turn:.3f} | {self.told_shift:.3f} |'
         )
 
 
@@ -113,15 +122,22 @@ def score(records: list[Record], twists: Array, exposures: Array) -> Score:
         for record, exposure in zip(records, exposures, strict=True)
     ]
     right = np.sum(told[known, :3] * twists[known, :3], axis=1) > 0
-    miss, whole = np.square(np.nan_to_num(told) - twists), np.square(twists)
     return Score(
         exposure=float(np.median(off)),
-        turn=float(np.sqrt(miss[:, :3].sum() / whole[:, :3].sum())),
-        shift=float(np.sqrt(miss[:, 3:].sum() / whole[:, 3:].sum())),
+        turn=_error(np.nan_to_num(told), twists, slice(0, 3)),
+        shift=_error(np.nan_to_num(told), twists, slice(3, 6)),
         sign=float(np.mean(right)) if known.any() else 0.5,
         told=float(np.mean(known)),
+        told_turn=_error(told[known], twists[known], slice(0, 3)),
+        told_shift=_error(told[known], twists[known], slice(3, 6)),
         errors=tuple(off),
     )
+
+
+def _error(found: Array, true: Array, part: slice) -> float:
+    """Give the rms error of a part of velocities (n, 6) over that of no motion; 1 without any."""
+    whole = float(np.square(true[:, part]).sum())
+    return math.sqrt(np.square(found - true)[:, part].sum() / whole) if whole else 1.0
 
 
 def right_again(records: list[Record], twists: Array) -> str:
@@ -166,7 +182,7 @@ def main() -> None:
     spoil(args.imu)
     if args.no_ahead:
         look_ahead_no_more()
-    print('| stream | exposure | angular | linear | sign % | told % |\n|---|---|---|---|---|---|')
+    print(HEAD)
     errors: list[float] = []
     for bag in sorted(path for path in args.folder.iterdir() if not path.name.startswith('.')):
         records, (twists, exposures) = estimates(bag, args.mode), truth_of(bag)

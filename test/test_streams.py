@@ -21,7 +21,7 @@ def test_what_is_right_has_no_error():
     found = score([record(twist) for twist in TWISTS], TWISTS, np.full(20, EXPOSURE))
     assert (found.exposure, found.sign, found.told) == (0, 1, 1)
     assert found.turn == pytest.approx(0, abs=1e-12)
-    assert str(found) == '| 0.0 % | 0.000 | 0.000 | 100 | 100 |'
+    assert str(found) == '| 0.0 % | 0.000 | 0.000 | 100 | 100 | 0.000 | 0.000 |'
 
 
 def test_a_frame_that_tells_nothing_counts_as_still():
@@ -29,6 +29,7 @@ def test_a_frame_that_tells_nothing_counts_as_still():
     found = score(silent, TWISTS, np.full(20, EXPOSURE))
     assert found.told == 0.75
     assert found.turn == found.shift == pytest.approx(0.5)
+    assert found.told_turn == pytest.approx(0, abs=1e-12)
     assert np.isnan(velocities(silent)).any(axis=1).sum() == 5
     unknown = [record(twist, exposure=None) for twist in TWISTS]
     assert score(unknown, TWISTS, np.full(20, EXPOSURE)).exposure == 1
