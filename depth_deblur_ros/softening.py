@@ -8,7 +8,6 @@ half a pixel, docs/method.md (58). One frame alone tells nothing below 2 px.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -42,23 +41,24 @@ _F = np.stack([_FX[_BAND], _FY[_BAND]])  # (2, m) cycles/px
 
 
 def exposure_from_softness(
-    views: Sequence[View],
+    first: tuple[View, Vector],
+    second: tuple[View, Vector],
     way: Vector,
-    velocities: Sequence[Vector],
+    *,
     known: Exposure | None,
     longest: float,
 ) -> Exposure | None:
     """
     Give the exposure that two neighbouring frames have in common; None where they do not tell.
 
-    way (6,): the motion from the first to the second; velocities (6,) [rad/s, m/s] at both;
-    longest [s]: what the exposure may be.
+    first, second: a frame and its velocity (6,) [rad/s, m/s]; way (6,): the motion from one to the
+    other; longest [s]: what the exposure may be.
     """
-    first, second = views
+    (before, then), (after, now) = first, second
     half = SIDE // 2
-    rows, columns = first.grey.shape
+    rows, columns = before.grey.shape
     y, x = np.mgrid[half : rows - half : STEP, half : columns - half : STEP].reshape(2, -1)
-    j = interaction_matrix(x, y, first.depth[y, x].astype(np.float64), first.camera)
+    j = interaction_matrix(x, y, before.depth[y, x].astype(np.float64), before.camera)
     moved = j @ way
     inside = np.asarray(np.isfinite(moved).all(axis=1))
     x2, y2 = np.rint(np.stack([x, y]) + np.where(inside[:, None], moved, 0).T).astype(int)
@@ -66,9 +66,9 @@ def exposure_from_softness(
     if inside.sum() < FEWEST:
         return None
     log, weight = _ratio(
-        _power(first, x[inside], y[inside]), _power(second, x2[inside], y2[inside])
+        _power(before, x[inside], y[inside]), _power(after, x2[inside], y2[inside])
     )
-    along = [(j[inside] @ u) @ _F for u in velocities]
+    along = [(j[inside] @ u) @ _F for u in (then, now)]
     straight = np.maximum(*np.abs(along)) * longest < STRAIGHT
     bend = -(math.pi**2) / 3 * (np.square(along[0]) - np.square(along[1]))
     found = _fitted(log, bend, weight * straight, known)

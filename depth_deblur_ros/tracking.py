@@ -88,11 +88,12 @@ class Tracker:
         self._shutter = Shutter()
         self._last: Seen | None = None
         self._ahead: Seen | None = None
+        self._past: tuple[View, Vector] | None = None  # the frame before that, and its velocity
         self._cadence, self._habits = Cadence(), Habits()
 
     def state(self) -> Any:
         """Give all that is remembered, as something that can be pickled."""
-        frames = (self._last, self._ahead, self._cadence, self._habits)
+        frames = (self._last, self._ahead, self._past, self._cadence, self._habits)
         own = (self._glide, self._shutter, frames, self.gyro.trial)
         return own, self._solve.state() if isinstance(self._solve, Memory) else None
 
@@ -100,7 +101,7 @@ class Tracker:
         """Remember this, and nothing else."""
         own, inner = state
         self._glide, self._shutter, frames, self.gyro.trial = own
-        self._last, self._ahead, self._cadence, self._habits = frames
+        self._last, self._ahead, self._past, self._cadence, self._habits = frames
         if isinstance(self._solve, Memory):
             self._solve.restore(inner)
 
@@ -145,23 +146,31 @@ class Tracker:
         look = np.eye(6, 12)
         look[:, 6:] = self._habits.readout * self._cadence.usual * row_skew(seen.view)
         if told is None:
-            self._compare(before, seen, look @ glide.mean)
+            self._compare(before, seen, look @ glide.mean if self._ahead else None)
         context = Context(glide, self._shutter, told, self._cadence.usual, known, look)
         return self._turned(frame.stamp_ns, context, params)
 
-    def _compare(self, before: tuple[Seen | None, Glide], seen: Seen, now: Vector) -> None:
-        """Let the change of sharpness since the last frame tell the exposure, (58)."""
+    def _compare(self, before: tuple[Seen | None, Glide], seen: Seen, now: Vector | None) -> None:
+        """
+        Let the change of sharpness tell the exposure, (58).
+
+        Of this frame against the last one where its velocity (6,) now is known from both sides,
+        else of the last one against the one before that.
+        """
         last, glide = before
+        past, self._past = self._past, None
         if last is None or seen.between is None:
             return
         then = glide.before(*self._way(seen.between, self._cadence)).velocity
-        found = exposure_from_softness(
-            (last.view, seen.view),
-            seen.between.motion,
-            (then, now),
-            known=self._shutter.exposure,
-            longest=LONGEST * self._cadence.usual,
-        )
+        self._past = here = (last.view, then)
+        if now is not None:
+            ends, way = (here, (seen.view, now)), seen.between.motion
+        elif past and last.between:
+            ends, way = (past, here), last.between.motion
+        else:
+            return
+        longest = LONGEST * self._cadence.usual
+        found = exposure_from_softness(*ends, way, known=self._shutter.exposure, longest=longest)
         if found:
             self._shutter = self._shutter.measured(found)[0]
 

@@ -28,13 +28,18 @@ def motion(pixels):
     return np.array([0, 0, 0, pixels * 2.0 / 200, 0, 0])
 
 
+def asked(views, velocities, way, known=None):
+    first, second = zip(views, velocities, strict=True)
+    return exposure_from_softness(first, second, motion(way), known=known, longest=INTERVAL)
+
+
 def found(speeds, exposures=(T, T), known=None, noise=0.5):
     way = sum(speeds) / 2 * INTERVAL
     views = [
         view(k * way, s, e, noise) for k, (s, e) in enumerate(zip(speeds, exposures, strict=True))
     ]
     velocities = [motion(speed) for speed in speeds]
-    return exposure_from_softness(views, motion(way), velocities, known, INTERVAL)
+    return asked(views, velocities, way, known)
 
 
 @pytest.mark.parametrize('speeds', [(20, 60), (90, 30), (-30, 75), (10, -100)])
@@ -58,7 +63,7 @@ def test_noise_is_foreseen():
 def test_another_scene_is_not_believed():
     other = View(np.roll(view(0, 60).grey, 97, axis=1), DEPTH, CAMERA)
     velocities = (motion(20), motion(60))
-    wrong = exposure_from_softness((view(0, 20), other), motion(1.3), velocities, None, INTERVAL)
+    wrong = asked((view(0, 20), other), velocities, 1.3)
     assert wrong is None or wrong.doubt > 0.3
 
 
@@ -67,12 +72,12 @@ def test_without_depth_or_overlap_there_is_no_answer():
     velocities = (motion(20), motion(60))
     for first, way in ((hole, 1.3), (view(0, 20), 250)):
         views = (first, view(1.3, 60))
-        assert exposure_from_softness(views, motion(way), velocities, None, INTERVAL) is None
+        assert asked(views, velocities, way) is None
     flat = View(np.full(DEPTH.shape, 90, np.uint8), DEPTH, CAMERA)
-    assert exposure_from_softness((flat, flat), motion(1), velocities, None, INTERVAL) is None
+    assert asked((flat, flat), velocities, 1) is None
 
 
 def test_no_exposure_is_longer_than_it_can_be():
     views = [view(0, 30), view(1.5, 90)]
     slow = [motion(0.3), motion(0.9)]  # as a camera that starts again looks at first
-    assert exposure_from_softness(views, motion(1.5), slow, None, INTERVAL) is None
+    assert asked(views, slow, 1.5) is None
