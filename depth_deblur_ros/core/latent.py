@@ -20,6 +20,7 @@ import math
 
 import cv2
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
+from depth_deblur_ros.core.compression import block_sigma
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, MIN_SIDE, Motion
 from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
@@ -78,7 +79,7 @@ def restore_coarse_to_fine(
     At half the size an eighth of the work brings most of what is long and slow to converge, and
     so on. Noise makes the prior weigh more, which takes fewer steps.
     """
-    sigma = noise_sigma(blurred)
+    sigma = math.hypot(noise_sigma(blurred), block_sigma(blurred))
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
     steps = replace(steps, inner=math.ceil(worth * steps.inner))
     return _restored(blurred, depth, motion, camera, (sigma, steps))
