@@ -31,6 +31,7 @@ VISIBLE_PX = 0.1  # px; least blur that neighbours may claim where the image alo
 SHARP_PX, SHARP_DOUBT = 2.0, 0.25  # px, relative; blur of a picture that looks sharp
 CLAIM_PX = 4.0  # px; most blur that they may claim where the image looks sharp
 VAGUE = 0.6  # doubt of an exposure beyond which nothing can be claimed
+UNSEEN = 0.75  # m/s; standard deviation of a shift that only its prior tells
 WORD = 0.5  # quality of a motion that only the neighbours tell
 
 
@@ -151,13 +152,21 @@ def _signed(result: DeblurResult, p: Vector, covariance: Vector) -> DeblurResult
     return replace(result, motion=Motion.from_vector(p, covariance), sign_resolved=True)
 
 
+def _without_unseen(p: Vector, covariance: Vector, seconds: float) -> tuple[Vector, Vector]:
+    """Tell no shift where nobody has seen one, as where a gyro alone tells the turn."""
+    if np.sqrt(np.trace(covariance[3:, 3:]) / 3) < UNSEEN * seconds:
+        return p, covariance
+    shift = np.concatenate([np.zeros(3), p[3:]])
+    return p - shift, covariance + np.outer(shift, shift)
+
+
 def _claimed(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Joined:
     """Give a frame that shows no motion by itself the one its neighbours tell, if any, (53)."""
     exposure = context.exposure
     unclaimed = Joined(result, exposure, context.shutter)
     if exposure is None or exposure.doubt > VAGUE:
         return unclaimed
-    p, covariance = context.over(exposure.seconds)
+    p, covariance = _without_unseen(*context.over(exposure.seconds), exposure.seconds)
     blur_px = blur_length(p, result.depth, camera)
     most = CLAIM_PX if result.outcome is Outcome.SHARP else math.inf
     sure = float(p @ np.linalg.solve(covariance, p)) > CLEAR

@@ -7,6 +7,7 @@ import pickle
 from depth_deblur_ros import tracking
 from depth_deblur_ros.core.data import InputError, Outcome
 from depth_deblur_ros.core.params import SolverParams
+from depth_deblur_ros.joining import _without_unseen
 from depth_deblur_ros.tracking import Tracker
 import numpy as np
 import pytest
@@ -211,3 +212,13 @@ def test_the_image_is_restored_anew_under_a_motion_that_is_not_its_own(monkeypat
     np.testing.assert_allclose(found.motion.vector, restored[0], atol=1e-4)
     np.testing.assert_array_equal(found.image, 1 - frames[4].image)
     assert found.seconds >= 0.5
+
+
+def test_a_shift_that_nobody_has_seen_is_not_told():
+    p, seconds = np.array([0.01, 0.02, 0, 0.03, 0, 0.01]), 0.02
+    seen, unseen = (np.diag([1e-4] * 3 + [(sd * seconds) ** 2] * 3) for sd in (0.1, 1.4))
+    told, covariance = _without_unseen(p, seen, seconds)
+    assert told is p and covariance is seen
+    told, covariance = _without_unseen(p, unseen, seconds)
+    np.testing.assert_array_equal(told, [0.01, 0.02, 0, 0, 0, 0])
+    assert (np.diag(covariance)[3:] >= np.diag(unseen)[3:] + np.square(p[3:])).all()
