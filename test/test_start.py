@@ -6,11 +6,12 @@ import cv2
 from depth_deblur_ros.core import start
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
 from depth_deblur_ros.core.evidence import motion_axes
-from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.geometry import blur_length, flow
 from depth_deblur_ros.core.start import blind_start
 import numpy as np
 from pictures import swept, texture
 import pytest
+from speed_frames import blurred_frame
 
 CAMERA = CameraIntrinsics(262.0, 262.0, 159.5, 119.5, 320, 240)
 DEPTH = np.full((240, 320), 2, np.float32)
@@ -178,3 +179,15 @@ def test_a_short_blur_is_as_long_as_it_is(length):
         motion = blind_start(swept(texture(k), length, 0.8 * k, 0.005), DEPTH, CAMERA).motion
         found.append(np.linalg.norm(flow(motion.vector, DEPTH, CAMERA), axis=-1).mean())
     assert np.mean(found) == pytest.approx(length, rel=0.06)
+
+
+@pytest.mark.parametrize('length', [60, 70])
+def test_a_blur_beyond_the_full_scale_is_not_taken_for_half_of_it(length):
+    frame, true = blurred_frame(640, 480, length)
+    result = blind_start(frame.image.mean(2), frame.depth, frame.camera)
+    assert result.outcome is Outcome.SOLVED
+    apart = [
+        blur_length(result.motion.vector - s * true.vector, frame.depth, frame.camera)
+        for s in (1, -1)
+    ]
+    assert min(apart) < 0.05 * length

@@ -35,6 +35,7 @@ MANY = 40  # patches of a scale, of which half are heard on all proposals
 HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that all patches judge; that seeds are of
 SEEDS = 8  # distinct motions that each scale refines
 NEAR = 3.0  # px; how wide it is searched around a guess
+DEEPER = 1.08  # times as deep bands make twice a motion likelier
 ROOM = 10  # px of templates around the guess, more than the search around it goes
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
@@ -57,6 +58,20 @@ def find(spectra: dict[int, Spectra], guess: Vector | None) -> tuple[Vector, lis
     """Let each scale propose and all choose; q (6,), and what the scales say of all motions."""
     scales = _scales(spectra)
     return _search(scales, guess), scales
+
+
+def ask_twice(q: Vector, scales: list[Scale]) -> tuple[Vector, list[Scale]]:
+    """
+    Give twice the motion where that is what coarse scales see, and they alone then.
+
+    A blur that leaves the full scale's table is there taken for half of it.
+    """
+    coarse = scales[1:]
+    if not coarse:
+        return q, scales
+    twice = _refine(_refine(2 * q[None], coarse, 2 * NEAR), coarse, 1.0)[0]
+    one, other = common_score(np.array([q, twice]), coarse)
+    return (twice, coarse) if other < DEEPER * one else (q, scales)
 
 
 def find_near(spectra: dict[int, Spectra], guess: Vector) -> tuple[Vector, list[Scale]]:

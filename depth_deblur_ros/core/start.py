@@ -17,6 +17,7 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Out
 from depth_deblur_ros.core.evidence import motion_axes, scores, Spectra
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.search import (
+    ask_twice,
     CLOSE,
     close_up,
     common_score,
@@ -25,6 +26,7 @@ from depth_deblur_ros.core.search import (
     find_short,
     look,
     Scale,
+    SHARE,
 )
 from depth_deblur_ros.core.trust import covariance_from_curvature, Edges
 import numpy as np
@@ -48,6 +50,7 @@ CLEARLY_SHARP, RATHER_SHARP = (
 )  # trust.sharpness: nothing to search; no motion and no blur
 OUT_OF_FOCUS = 1.07  # trust.sharpness across the motion, which leaves that as it is
 EDGED = 1.035  # edges of a picture with so little blur that it is seen close up alone
+HALVED = 24.0  # px; shorter motions are no halves of what the full scale cannot see
 LONG, LONGEST = 20.0, 30.0  # px; few, and hardly any, pictures with such a blur have edges
 EDGED_COARSE = 1.06  # like these at half the size, where noise makes none: DOUBT, and twice
 SMEARED, SMEAR = 1.005, 8.0  # edges that no blur below so many px leaves
@@ -96,7 +99,7 @@ def blind_start(
     q, scales = _found(spectra, first, length, edges)
     trusted = _trusted(q, length(q), scales, edges)
     look_closer = length(q) < CLOSE_BELOW if trusted else edges.along > EDGED
-    if look_closer:
+    if look_closer and scales[0].factor == 1:
         close = close_up(grey, depth, camera, axes)
         closer, both = find_short(scales[0], close, q if trusted else None)
         if _short_trusted(closer, length(closer), both):
@@ -125,7 +128,8 @@ def _found(
         q, scales = find_near(spectra, first)
         if length(q - first) <= ASTRAY and _trusted(q, length(q), scales, edges):
             return q, scales
-    return find(spectra, first)
+    q, scales = find(spectra, first)
+    return ask_twice(q, scales) if length(q) > HALVED else (q, scales)
 
 
 def _trusted(q: Vector, length: float, scales: list[Scale], edges: Edges) -> bool:
@@ -138,7 +142,8 @@ def _trusted(q: Vector, length: float, scales: list[Scale], edges: Edges) -> boo
     doubt = DOUBT ** (sharp + (sharp and length > LONGEST))
     alone = ALONE_TRUST if length > ALONE_SHORT else ALONE_SHORT_TRUST
     needed = doubt * (LONG_TRUST if len(scales) > 1 else alone)
-    return bool(common_score(q[None], scales)[0] < -needed)
+    said = common_score(q[None], scales)[0] / SHARE[scales[0].factor]
+    return bool(said < -needed)
 
 
 def _short_trusted(q: Vector, length: float, both: list[Scale]) -> bool:
