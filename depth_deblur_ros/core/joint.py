@@ -11,7 +11,7 @@ Notation: p (6,) motion; g_k, H_k slope and curvature of part k; C_0 the start's
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 import math
@@ -35,8 +35,8 @@ READABLE = 50.0  # px; longer blurs are refined at half the size, or less
 AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
-MOVES = 2  # from the start; more gain nothing
-LONGEST_MOVE, LEAST_MOVE = 1.0, 0.02  # px
+MOVES = 4
+LONGEST_MOVE, LEAST_MOVE = 1.0, 0.1  # px
 SOFTEST, DISSENT = (
     10.0,
     10.0,
@@ -64,15 +64,18 @@ def refine(
 
     certainty = np.asarray(np.linalg.inv(start.covariance), np.float64)
     parts = _parts(light, depth, camera, length(start.vector), budget)
-    parts = _each(lambda part: settled(part, start.vector), parts)
-    return _moved(parts, start.vector, certainty, length)
+    begun = _each(lambda part: _begun(part, start.vector), parts)
+    return _moved(begun, start.vector, certainty, length)
 
 
 def _moved(
-    parts: list[Part], start: Vector, certainty: Vector, length: Callable[[Vector], float]
+    begun: list[tuple[Part, Vector, Vector]],
+    start: Vector,
+    certainty: Vector,
+    length: Callable[[Vector], float],
 ) -> Motion:
     """Go where the slope of the likelihood and the pull of the start balance."""
-    slopes, curvatures = zip(*_each(lambda part: _slope_and_bend(part, start), parts), strict=True)
+    parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), start
     bend = bends.sum(0)
     for k in range(MOVES):
@@ -92,13 +95,14 @@ def _slope(part: Part, p: Vector) -> Vector:
     return slope_of(posterior(part, p))[0]
 
 
-def _slope_and_bend(part: Part, p: Vector) -> tuple[Vector, Vector]:
-    found = posterior(part, p)
+def _begun(part: Part, p: Vector) -> tuple[Part, Vector, Vector]:
+    """Settle a part at the start; give it with its slope and curvature there."""
+    found = settled(part, p)
     slope, image = slope_of(found)
-    return slope, curvature_of(found, image)
+    return found.part, slope, curvature_of(found, image)
 
 
-def _each(work: Callable[[Part], Result], parts: list[Part]) -> list[Result]:
+def _each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """Work on the parts side by side: they are too small for two threads to share one."""
     threads = get_num_threads()  # starts numba's threads, if none run yet
     if threading_layer() == 'workqueue':  # without OpenMP; ends the process of two callers

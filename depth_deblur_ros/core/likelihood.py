@@ -31,8 +31,10 @@ from depth_deblur_ros.core.motion import blur_and_slope
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 
-REWEIGHTINGS, STEPS = 3, 10  # of the image step
-SETTLING = 5  # reweightings after each of which noise and prior follow the image
+REWEIGHTINGS, STEPS = 4, 10  # of the image step
+# In the last of them: what so few steps leave undone changes its sign from one to the next, and
+# the motion with it.
+LAST_STEPS = 15
 PRIORS = (0.2, 60.0)  # where its weight stays
 DOUBTED = 3.0  # sigma; what is missed by as much counts half
 LEAST_COUNT = 1e-4
@@ -86,32 +88,32 @@ class Posterior:
     latent: FloatImage
 
 
-def settled(part: Part, p: Vector) -> Part:
-    """Let noise and prior follow what is left of the data and what the latent image is made of."""
-    return _posterior(part, p, SETTLING, follow=True).part
+def settled(part: Part, p: Vector) -> Posterior:
+    """As `posterior`, with noise and prior that follow what is left of the data and the image."""
+    return _posterior(part, p, follow=True)
 
 
 def posterior(part: Part, p: Vector) -> Posterior:
     """Find mu and two samples s for a motion p (6,)."""
-    return _posterior(part, p, REWEIGHTINGS, follow=False)
+    return _posterior(part, p, follow=False)
 
 
-def _posterior(part: Part, p: Vector, reweightings: int, *, follow: bool) -> Posterior:
+def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
     """Run the image step on three planes: the image, and two of noise alone."""
     blur = blur_operator(Motion.from_vector(p), part.depth, part.camera)
     sweep, transfer = blur.sweep, part.camera.transfer
     within = sweep.blurred_planes(np.ones((*part.light.shape, 3), np.float32))
     latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
     data, trust = _observed(part, sweep)
-    for _ in range(reweightings):
+    for k in reversed(range(REWEIGHTINGS)):
         sigma = part.scales.sigma
         stored = np.repeat(stored_from_light(latent[:1], transfer), 3, 0)
         weight = np.float32(part.scales.prior * sigma**2)
         problem = reweighted(stored, sweep, transfer, trust, weight)
         push = problem.slope(data - sweep.gather(latent, within), latent)
         push[1:] += sigma * _prior_noise(problem, part.seed)
-        latent = conjugate_gradients(problem, latent, push, STEPS)
-        if follow:
+        latent = conjugate_gradients(problem, latent, push, STEPS if k else LAST_STEPS)
+        if follow and k:
             missing = data - sweep.gather(latent, within)
             missing[1:] -= data[1:]
             part = _followed(part, problem, latent, missing)

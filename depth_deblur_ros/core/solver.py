@@ -42,7 +42,7 @@ import numpy as np
 SATURATED, EVENLY = 0.98, 0.02  # stored values; how many more pixels a channel may have there
 SPARSE = 4  # every so many-th pixel tells that
 FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
-FULL_BUDGET, FAST_BUDGET = 200_000, 120_000  # px that the joint refinement looks at
+FULL_BUDGET, FAST_BUDGET = 200_000, 80_000  # px that the joint refinement looks at
 
 
 def deblur(
