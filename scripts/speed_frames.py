@@ -11,7 +11,6 @@ from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import light_from_stored, stored_from_light
 from numba import njit, prange, set_num_threads
 import numpy as np
-from skimage.restoration import richardson_lucy, wiener
 
 KERNEL, STEPS = 25, 30  # side [px] and iterations of Richardson-Lucy
 NOISE = 0.005  # stored values
@@ -60,6 +59,8 @@ def line_kernel(length: float) -> FloatImage:
 
 def peers(image: FloatImage, length: float) -> dict[str, Callable[[], object]]:
     """Give the peers by name; each is told one straight blur for the whole image."""
+    from skimage.restoration import richardson_lucy, wiener  # no part of our memory and start
+
     psf = line_kernel(length)
     channels = [np.ascontiguousarray(image[..., c]) for c in range(3)]
     return {

@@ -125,7 +125,7 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
 def _observed(part: Part, sweep: Sweep) -> tuple[FloatImage, FloatImage]:
     """Give planes of the blurred light and twice the noise that it may have, and of W."""
     height, width = part.light.shape
-    noise = _noise(part.seed, height, width)[-1, :, :, :width]
+    noise = _data_noise(part.seed, height, width)[:, :, :width]
     spread = part.scales.sigma * part.slope / np.sqrt(np.maximum(part.counts, LEAST_COUNT))
     data = np.stack([part.light, *(spread * noise)], 2).astype(np.float32)
     trust = np.repeat(part.trust[..., None], 3, 2)
@@ -163,7 +163,7 @@ def _prior_noise(problem: Quadratic, seed: int) -> FloatImage:
     out = np.zeros((2, height, width), np.float32)
     room = problem.sweep.room
     first = max(AROUND - room, 0)
-    noise = _noise(seed, max(height - 2 * room + 2 * AROUND, height), width + 2 * AROUND)
+    noise = _link_noise(seed, max(height - 2 * room + 2 * AROUND, height), width + 2 * AROUND)
     noise = noise[:, :, first : first + height, first : first + width]
     for k, (here, there) in enumerate(_ends((height, width))):
         n = np.sqrt(_link(problem, k, here, there)) * noise[(k, slice(None), *here)]
@@ -172,9 +172,19 @@ def _prior_noise(problem: Quadratic, seed: int) -> FloatImage:
     return out
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=8)
+def _link_noise(seed: int, height: int, width: int) -> FloatImage:
+    """Give unit noise (4, 2, height, at least width) of the links."""
+    return np.array(_noise(seed, height, width)[:-1])  # a copy: the rest is not kept
+
+
+@lru_cache(maxsize=8)
+def _data_noise(seed: int, height: int, width: int) -> FloatImage:
+    """Give unit noise (2, height, at least width) of the data."""
+    return np.array(_noise(seed, height, width)[-1])
+
+
 def _noise(seed: int, height: int, width: int) -> FloatImage:
-    """Give unit noise (5, 2, height, at least width): of four links, and of the data."""
     rng = np.random.default_rng(seed)
     return rng.standard_normal((5, 2, height, -(-width // 128) * 128), np.float32)
 
