@@ -87,7 +87,7 @@ def solve_cases(
 def _solve_case(case: Path, target: Path, params: SolverParams, *, oracle: bool) -> Row:
     frame = read_frame(*(case / name for name in CASE_FILES))
     if oracle:
-        result = restore_known(frame, _read_motion(case / 'truth/motion.json'), params)
+        result = restore_known(frame, read_motion(case / 'truth/motion.json'), params)
     else:
         result = deblur(frame, params)
     write_image(target / 'deblurred.png', result.image)
@@ -99,7 +99,7 @@ def _solve_case(case: Path, target: Path, params: SolverParams, *, oracle: bool)
 def _score(case: Path, frame: RgbdFrame, result: DeblurResult) -> Score:
     """Compare a result with the case's truth."""
     truth = read_frame(case / 'truth/sharp.png', case / 'truth/depth.png', case / 'camera.json')
-    motion = _read_motion(case / 'truth/motion.json')
+    motion = read_motion(case / 'truth/motion.json')
     sharp, blurred, found = (_as_8bit(image) for image in (truth.image, frame.image, result.image))
     epe, bad = flow_error(truth, motion, result.motion)
     return Score(
@@ -113,7 +113,8 @@ def _score(case: Path, frame: RgbdFrame, result: DeblurResult) -> Score:
     )
 
 
-def _read_motion(path: Path) -> Motion:
+def read_motion(path: Path) -> Motion:
+    """Read the motion that a truth/motion.json tells."""
     try:
         record = json.loads(path.read_text())
         return Motion(record['theta'], record['v'])

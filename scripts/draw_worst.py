@@ -14,7 +14,7 @@ import argparse
 import json
 from pathlib import Path
 
-from depth_deblur_ros.bench import CASE_FILES
+from depth_deblur_ros.bench import CASE_FILES, read_motion
 from depth_deblur_ros.core.data import Motion, RgbdFrame
 from depth_deblur_ros.core.solver import deblur, restore_known
 from depth_deblur_ros.folders import read_frame, write_image
@@ -49,10 +49,9 @@ def main() -> None:
     args = parser.parse_args()
     for rank, name in enumerate(worst_cases(args.table, args.count), 1):
         case = args.cases / name
-        record = json.loads((case / 'truth/motion.json').read_text())
         picture = both_ways(
             read_frame(*(case / file for file in CASE_FILES)),
-            Motion(record['theta'], record['v']),
+            read_motion(case / 'truth/motion.json'),
         )
         write_image(args.out / f'{rank}_{name}.jpg', picture)
         print(args.out / f'{rank}_{name}.jpg')

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from depth_deblur_ros.bag import BagWriter
-from depth_deblur_ros.core.data import CameraIntrinsics, Motion
+from depth_deblur_ros.core.data import CameraIntrinsics
 from depth_deblur_ros.messages import camera_info_fields, header_fields
-from make_sample_bag import FRAME_ID, picture_fields, START_NS, twist_fields
+from make_sample_bag import FRAME_ID, picture_fields, SampleFrame, START_NS, twist_fields
 import numpy as np
 import numpy.typing as npt
 from scene import make_scene, Scene
@@ -92,13 +92,9 @@ def write_gyro(bag: BagWriter, path: Trajectory, until: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One frame as the sensors give it, and what is true of it."""
+class Shot(SampleFrame):
+    """One frame as the sensors give it, what is true of it, and for how long it was taken."""
 
-    stamp_ns: int  # mid-exposure
-    colour: npt.NDArray[np.uint8]  # (H, W, 3) RGB
-    depth: npt.NDArray[np.uint16]  # (H, W), millimetres, 0 = hole
-    motion: Motion
     exposure: float  # s
 
 
