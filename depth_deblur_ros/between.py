@@ -26,7 +26,6 @@ THERE_AND_BACK = 0.7  # px; a track that does not come back is none
 SAME_SURFACE = 0.15  # relative depth between both ends of a track
 ROUNDS = 12
 FINEST = 0.2  # px; no track is better than this
-EVERY = 10  # px; of the pixels that stand for all
 ROLL_RIDGE = 40.0  # px^2/rad^2; keeps what nothing tells of a rolling shutter near zero
 CUT = 3.0  # standard deviations; what is farther off does not count
 FEWEST, LEAST_SHARE = 20, 0.4  # of the tracks must agree
@@ -106,19 +105,6 @@ def motion_between(first: View, second: View) -> Between | None:
     j = interaction_matrix(middle[:, 0], middle[:, 1], depth[good], first.camera)
     height = first.camera.height
     return _fit(j, flow, (middle[:, 1] - first.camera.cy) / height, height)
-
-
-def row_skew(view: View) -> Vector:
-    """Give the (6, 6) of which a rolling shutter's blur has too much, as Between.skew."""
-    y, x = np.mgrid[: view.camera.height : EVERY, : view.camera.width : EVERY].reshape(2, -1)
-    depth = view.depth[y, x].astype(np.float64)
-    seen = depth > 0
-    if seen.sum() < FEWEST:
-        return np.zeros((6, 6))
-    j = interaction_matrix(x[seen], y[seen], depth[seen], view.camera)
-    row = (y[seen] - view.camera.cy) / view.camera.height
-    late = np.einsum('n,nij,nik->jk', row, j, j)
-    return np.linalg.solve(np.einsum('nij,nik->jk', j, j) + 1e-9 * np.eye(6), late)
 
 
 def _tracks(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[Vector, Vector]:

@@ -63,9 +63,9 @@ class Glide:
         """Tell whether anything was seen of the velocity yet."""
         return bool(self.spread[0, 0] < FAST[0] ** 2)
 
-    def measured(self, velocity: Vector, covariance: Vector, look: Vector | None = None) -> Glide:
-        """Take in a measured velocity (6,), look (6, 12) @ (u, a), with its covariance (6, 6)."""
-        look = np.eye(6, 12) if look is None else look
+    def measured(self, velocity: Vector, covariance: Vector) -> Glide:
+        """Take in a measured velocity (6,) with its covariance (6, 6)."""
+        look = np.eye(6, 12)
         return self._updated(look, velocity - look @ self.mean, covariance)
 
     def moved(self, seconds: float, way: Way | None) -> Glide:

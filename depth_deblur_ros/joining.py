@@ -40,8 +40,7 @@ class Context:
     """
     What the neighbours tell: velocity, exposure, frame interval [s], and whether they saw.
 
-    look (6, 12): a blur shows look @ (velocity, acceleration), more than the velocity where the
-    shutter rolls.
+    reading: s from one row's exposure to that of the row whose yn is larger by 1.
     """
 
     glide: Glide
@@ -49,7 +48,7 @@ class Context:
     told: Exposure | None
     interval: float
     seen: bool
-    look: Vector
+    reading: float
     now: Exposure | None = None  # of this frame alone, where it differs from the shutter's
 
     @property
@@ -70,8 +69,9 @@ class Context:
 
     def blur(self, seconds: float) -> Motion:
         """Give the motion that the blur of an exposure shows."""
-        spread = seconds**2 * self.look @ self.glide.covariance @ self.look.T
-        return Motion.from_vector(seconds * self.look @ self.glide.mean, spread)
+        p, spread = self.over(seconds)
+        rolling = seconds * self.reading * self.glide.mean[6:9]
+        return Motion.from_vector(np.concatenate([p, rolling]), spread)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +95,14 @@ def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Jo
         return Joined(result, context.exposure, context.shutter)
     if result.outcome is not Outcome.SOLVED:
         return _claimed(result, _shortened(result, context, camera), camera)
-    axes = motion_axes(result.depth, camera)
+    axes = motion_axes(result.depth, camera)[:6, :6]
     covariance = REAL * result.motion.covariance + FLOOR_PX**2 * axes @ axes.T
     found = _measured(result.motion.vector, covariance, context)
     if found is None:
         return _claimed(result, context, camera)
-    motion = math.copysign(1, found.seconds) * result.motion.vector
+    if found.seconds < 0:
+        result = replace(result, motion=_reverse(result.motion))
+    motion = result.motion.vector
     doubt = math.hypot(found.doubt, INEXACT_PX / result.blur_px)
     length = Exposure(abs(found.seconds), doubt)
     shutter, exposure = context.shutter, context.told
@@ -110,7 +112,7 @@ def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Jo
         return Joined(_signed(result, motion, result.motion.covariance), exposure, shutter)
     along = np.outer(motion, motion) * exposure.doubt**2
     velocity = (motion / exposure.seconds, (covariance + along) / exposure.seconds**2)
-    context = replace(context, glide=context.glide.measured(*velocity, context.look))
+    context = replace(context, glide=context.glide.measured(*velocity))
     p, spread = context.over(exposure.seconds)
     joined = replace(_signed(result, p, spread), blur_px=blur_length(p, result.depth, camera))
     return Joined(joined, exposure, shutter, context.blur(exposure.seconds), velocity)
@@ -149,7 +151,12 @@ def _measured(p: Vector, covariance: Vector, context: Context) -> Exposure | Non
 
 
 def _signed(result: DeblurResult, p: Vector, covariance: Vector) -> DeblurResult:
-    return replace(result, motion=Motion.from_vector(p, covariance), sign_resolved=True)
+    motion = replace(result.motion, theta=p[:3], v=p[3:], covariance=covariance)
+    return replace(result, motion=motion, sign_resolved=True)
+
+
+def _reverse(motion: Motion) -> Motion:
+    return Motion.from_vector(-motion.by_rows, motion.covariance)
 
 
 def _without_unseen(p: Vector, covariance: Vector, seconds: float) -> tuple[Vector, Vector]:

@@ -133,7 +133,7 @@ def _colours(depth: npt.NDArray[np.floating], limits: tuple[float, float]) -> Pi
 
 def _with_paths(picture: Picture, result: DeblurResult, camera: CameraIntrinsics) -> Picture:
     """Draw the path of every grid point over the exposure, centred on the point."""
-    paths, zoom = flow(result.motion.vector, result.depth, camera), _zoom(camera.width)
+    paths, zoom = flow(result.motion.by_rows, result.depth, camera), _zoom(camera.width)
     lengths = zoom * np.hypot(paths[..., 0], paths[..., 1])
     drawn = picture.copy()
     if lengths.max() < 0.5:

@@ -19,7 +19,7 @@ import math
 import time
 from typing import Any, Protocol, runtime_checkable
 
-from depth_deblur_ros.between import Between, motion_between, row_skew, View, view_of
+from depth_deblur_ros.between import Between, motion_between, View, view_of
 from depth_deblur_ros.cadence import Cadence
 from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame, Vector
 from depth_deblur_ros.core.geometry import blur_length
@@ -31,7 +31,6 @@ from depth_deblur_ros.habits import Habits
 from depth_deblur_ros.joining import Context, GUESS, join, Joined, LONGEST
 from depth_deblur_ros.shutter import Exposure, Shutter
 from depth_deblur_ros.softening import exposure_from_softness
-import numpy as np
 
 GAP_S = 0.25  # frames farther apart are not neighbours
 SHORTEST_NS = 1_000_000  # between frames
@@ -123,7 +122,7 @@ class Tracker:
         joined = join(alone, context, frame.camera)
         self._shutter = joined.shutter
         if joined.velocity:
-            self._glide = self._glide.measured(*joined.velocity, context.look)
+            self._glide = self._glide.measured(*joined.velocity)
         result = self._restored(frame, params, alone, joined)
         return Tracked(replace(result, seconds=result.seconds + spent), joined.exposure)
 
@@ -143,11 +142,11 @@ class Tracker:
             cadence = self._cadence.later(self._ahead.seconds)
             glide = glide.before(*self._way(self._ahead.between, cadence))
             known = True
-        look = np.eye(6, 12)
-        look[:, 6:] = self._habits.readout * self._cadence.usual * row_skew(seen.view)
         if told is None:
-            self._compare(before, seen, look @ glide.mean if self._ahead else None)
-        context = Context(glide, self._shutter, told, self._cadence.usual, known, look)
+            self._compare(before, seen, glide.velocity if self._ahead else None)
+        height_per_yn = frame.camera.fy / frame.camera.height
+        reading = self._habits.readout * self._cadence.usual * height_per_yn
+        context = Context(glide, self._shutter, told, self._cadence.usual, known, reading)
         return self._turned(frame.stamp_ns, context, params)
 
     def _compare(self, before: tuple[Seen | None, Glide], seen: Seen, now: Vector | None) -> None:

@@ -54,9 +54,10 @@ def fill_uncovered(view, nearness):
 def displacements(blur):
     """Give (dx, dy), (H, W, N) each: how far [px] from its own place each pixel reads at t_i."""
     width, samples = blur.inverse_depth.shape[1:]
-    tx, ty, tz, vx, vy, vz, fx, fy = blur.motion.astype(np.float64)
+    vx, vy, vz, fx, fy = blur.motion[3:8].astype(np.float64)
     ray = blur.ray.astype(np.float64)
     xn, yn = ray[None, :width, None], ray[width:, None, None]
+    tx, ty, tz = (blur.motion[k] + yn * blur.motion[8 + k] for k in range(3))
     w, t = blur.inverse_depth.astype(np.float64), instants(samples)
     flow_x = fx * (-xn * yn * tx + (1 + xn**2) * ty - yn * tz + w * (vx - xn * vz))
     flow_y = fy * (-(1 + yn**2) * tx + xn * yn * ty + xn * tz + w * (vy - yn * vz))

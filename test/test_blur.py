@@ -49,7 +49,7 @@ def blurs(draw):
     rng = np.random.default_rng(draw(seeds))
     f = rng.uniform(0.8, 1.5, 2) * width
     camera = CameraIntrinsics(*f, width * rng.random(), height * rng.random(), width, height)
-    p = rng.normal(0, 1, 6) * (0.05, 0.05, 0.05, 0.08, 0.08, 0.05) * rng.random()
+    p = rng.normal(0, 1, 9) * (*[0.05] * 3, 0.08, 0.08, 0.05, *[0.05] * 3) * rng.random()
     depth = steps_in_depth(rng, (height, width))
     return blur_operator(Motion.from_vector(p), depth, camera), rng
 
@@ -268,7 +268,7 @@ def test_threads_share_one_row_or_none():
     rng = np.random.default_rng(0)
     seen = np.ones((3, 40, 8), np.float32)
     ray = np.linspace(-0.5, 0.5, 43, dtype=np.float32)
-    motion = np.array([0, 0.1, 0, 0, 0, 0, 30, 30], np.float32)
+    motion = np.array([0, 0.1, 0, 0, 0, 0, 30, 30, 0, 0, 0], np.float32)
     blur = BlurOperator(ray, motion, seen, 4)
     image = rng.random((3, 40, 3), np.float32)
     with on_threads(1):

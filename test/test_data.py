@@ -148,7 +148,7 @@ def test_a_motion_is_theta_then_v_and_cannot_change():
         assert array.dtype == np.float64
         with pytest.raises(ValueError, match='read-only'):
             array[0] = 1
-    with pytest.raises(InputError, match=r'p must have shape \(6,\), got \(5,\)'):
+    with pytest.raises(InputError, match=r'p must have shape \(6,\) or \(9,\), got \(5,\)'):
         Motion.from_vector(np.zeros(5))
 
 

@@ -7,6 +7,7 @@ from depth_deblur_ros.core.geometry import (
     interaction_matrix,
     normalised_grid,
     rotation_matrix,
+    rows_matrix,
     warp,
 )
 from hypothesis import given
@@ -81,12 +82,18 @@ def test_the_interaction_matrix_is_the_derivative_of_the_warp(seed):
 
 @given(seed=seeds)
 def test_the_flow_is_the_interaction_matrix_times_the_motion(seed):
-    depth, p = rough_depth(seed), np.random.default_rng(seed).normal(0, 0.1, 6)
+    depth, p = rough_depth(seed), np.random.default_rng(seed).normal(0, 0.1, 9)
     y, x = np.indices(depth.shape).astype(float)
-    expected = interaction_matrix(x, y, depth, CAMERA) @ p
-    found = flow(p, depth, CAMERA)
+    j = interaction_matrix(x, y, depth, CAMERA)
+    found = flow(p[:6], depth, CAMERA)
     assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(found, j @ p[:6], rtol=1e-6, atol=1e-5)
+    by_rows = flow(p, depth, CAMERA)
+    np.testing.assert_allclose(by_rows, rows_matrix(j, y, CAMERA) @ p, rtol=1e-6, atol=1e-5)
+    for row in (0, depth.shape[0] - 1):  # each row as if all turned as it does
+        theta = p[:3] + (row - CAMERA.cy) / CAMERA.fy * p[6:]
+        own = flow(np.concatenate([theta, p[3:6]]), depth, CAMERA)
+        np.testing.assert_allclose(by_rows[row], own[row], rtol=1e-5, atol=1e-4)
 
 
 @given(seed=seeds)

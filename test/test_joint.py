@@ -7,10 +7,10 @@ import sys
 
 from depth_deblur_ros.core import joint
 from depth_deblur_ros.core.blur import blur_operator
-from depth_deblur_ros.core.data import CameraIntrinsics, Motion
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.joint import refine
-from depth_deblur_ros.core.start import motion_axes
+from depth_deblur_ros.core.start import motion_axes, Start
 import numpy as np
 from pictures import texture
 import pytest
@@ -31,9 +31,10 @@ def blurred(truth, sigma=0.004):
 
 
 def start(p, sd=0.7):
-    """Give a motion with the covariance of so many pixels each way."""
+    """Give a first motion with the covariance of so many pixels each way."""
     axes = motion_axes(DEPTH, CAMERA)
-    return Motion.from_vector(p, sd**2 * axes @ axes.T)
+    spread = sd**2 * axes @ axes.T
+    return Start(Motion.from_vector(p), Outcome.SOLVED, 1.0, axes, spread)
 
 
 def off(p, truth=TRUTH):
@@ -60,7 +61,7 @@ def test_a_plain_wall_leaves_the_start():
 def test_an_image_that_tells_something_narrows_the_covariance():
     begun = start(TRUTH)
     found = refine(blurred(TRUTH), DEPTH, CAMERA, begun, BUDGET)
-    axes = np.linalg.inv(motion_axes(DEPTH, CAMERA))
+    axes = np.linalg.inv(motion_axes(DEPTH, CAMERA)[:6, :6])
     sd = np.sqrt(np.diag(axes @ found.covariance @ axes.T))
     assert (sd <= 0.7 + 1e-9).all()
     assert sd[0] < 0.35

@@ -40,7 +40,7 @@ class BlurOperator:
     """
 
     ray: npt.NDArray[np.float32]  # (H + W, ) xn of the columns, then yn of the rows
-    motion: npt.NDArray[np.float32]  # (8,): theta, v, fx, fy
+    motion: npt.NDArray[np.float32]  # (11,): theta, v, fx, fy, rolling
     inverse_depth: FloatImage  # (H, W, N) seen at each instant [1/m]
     margin: int
 
@@ -165,8 +165,9 @@ def _flow_parts(x, y, ray, width, m):  # type: ignore[no-untyped-def]
     """Give a and b of the flow a + w b at a pixel, (3) of docs/method.md."""
     xn, yn = ray[x], ray[width + y]
     one = np.float32(1)
-    ax = m[6] * (-xn * yn * m[0] + (one + xn * xn) * m[1] - yn * m[2])
-    ay = m[7] * (-(one + yn * yn) * m[0] + xn * yn * m[1] + xn * m[2])
+    tx, ty, tz = m[0] + yn * m[8], m[1] + yn * m[9], m[2] + yn * m[10]
+    ax = m[6] * (-xn * yn * tx + (one + xn * xn) * ty - yn * tz)
+    ay = m[7] * (-(one + yn * yn) * tx + xn * yn * ty + xn * tz)
     return ax, ay, m[6] * (m[3] - xn * m[5]), m[7] * (m[4] - yn * m[5])
 
 

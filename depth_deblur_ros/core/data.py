@@ -133,14 +133,19 @@ class Motion:
     A scene point X given in the camera frame at mid-exposure is at R(t theta) X + t v at time t in
     [-1/2, 1/2] (the paper's p_t = (t / 2T) p). theta (3,) rad, v (3,) m, covariance (6, 6) in the
     order theta, v. The camera's own velocity is -theta / exposure, -v / exposure.
+
+    rolling (3,) rad: rows that are read one after the other see different turns; row y sees
+    theta + yn rolling, yn = (y - cy) / fy.
     """
 
     theta: Vector
     v: Vector
     covariance: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
+    rolling: Vector = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        for name, shape in (('theta', (3,)), ('v', (3,)), ('covariance', (6, 6))):
+        shapes = {'theta': (3,), 'v': (3,), 'covariance': (6, 6), 'rolling': (3,)}
+        for name, shape in shapes.items():
             try:
                 value = np.array(getattr(self, name), np.float64)
             except (TypeError, ValueError):
@@ -156,16 +161,23 @@ class Motion:
     def from_vector(
         cls, p: npt.ArrayLike, covariance: npt.NDArray[np.float64] | None = None
     ) -> Motion:
-        """Make a motion from p (6,) = (theta, v)."""
+        """Make a motion from p (6,) = (theta, v), or (9,) = (theta, v, rolling)."""
         vector = np.asarray(p, np.float64)
-        if vector.shape != (6,):
-            raise InputError(f'p must have shape (6,), got {vector.shape}')
-        return cls(vector[:3], vector[3:], np.zeros((6, 6)) if covariance is None else covariance)
+        if vector.shape not in ((6,), (9,)):
+            raise InputError(f'p must have shape (6,) or (9,), got {vector.shape}')
+        spread = np.zeros((6, 6)) if covariance is None else covariance
+        rolling = vector[6:] if len(vector) > 6 else np.zeros(3)
+        return cls(vector[:3], vector[3:6], spread, rolling)
 
     @property
     def vector(self) -> Vector:
         """The motion as p (6,) = (theta, v)."""
         return np.concatenate([self.theta, self.v])
+
+    @property
+    def by_rows(self) -> Vector:
+        """The motion as p (9,) = (theta, v, rolling)."""
+        return np.concatenate([self.theta, self.v, self.rolling])
 
 
 @dataclass(frozen=True)

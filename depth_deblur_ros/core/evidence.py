@@ -7,7 +7,8 @@ a template without bands cannot win, docs/method.md (8) to (11).
 
 Notation: u (2,) flow of a patch over the exposure [px]; y_b log-spectrum of patch b and T_u
 template (templates.py), both without what scenes have by themselves; C_b(u) = <y_b, T_u> / n;
-D(u) = |T_u|^2 / n; p = G q motion, q (6,) in pixels (motion_axes).
+D(u) = |T_u|^2 / n; p = G q motion, q (6,) in pixels (motion_axes), or (9,) where
+rows may see different turns.
 
     S(p) = -sum_b w_b C_b(J_b p) / sqrt(sum_b w_b D(J_b p) + 0.1),    the lower the better
 """
@@ -18,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
-from depth_deblur_ros.core.geometry import interaction_matrix
+from depth_deblur_ros.core.geometry import interaction_matrix, rows_matrix
 from depth_deblur_ros.core.lanes import (
     larger,
     load,
@@ -56,7 +57,7 @@ SPARSE = 4  # every so many-th pixel of a patch tells its depth
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the patches of one scale say: C (B, rows, ACROSS), D, sag, w (B,), J G (B, 2, 6)."""
+    """What the patches of one scale say: C (B, rows, ACROSS), D, sag, w (B,), J G (B, 2, 9)."""
 
     match: FloatImage
     energy: FloatImage
@@ -67,7 +68,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """What is seen at one scale: y (B, n), w (B,), J G (B, 2, 6)."""
+    """What is seen at one scale: y (B, n), w (B,), J G (B, 2, 9)."""
 
     logs: FloatImage
     weight: FloatImage
@@ -93,7 +94,7 @@ def gather_spectra(
     """
     Look at the patches of one scale.
 
-    grey (H, W), valid (H, W) 0..1 (0 = saturated or not trusted), depth (H, W) [m]; axes G (6, 6).
+    grey (H, W), valid (H, W) 0..1 (0 = saturated or not trusted), depth (H, W) [m]; axes G (9, 9).
     """
     table = template_table()
     corners = _corners(grey.shape)
@@ -159,33 +160,35 @@ def _differences(grey: FloatImage) -> tuple[FloatImage, FloatImage]:
 def _flow_of_q(
     corners: list[tuple[int, int]], depth: FloatImage, camera: CameraIntrinsics, axes: Vector
 ) -> Vector:
-    """Give J_b G (B, 2, 6): the flow of each patch's middle, at the median depth there."""
+    """Give J_b G (B, 2, 9): the flow of each patch's middle, at the median depth there."""
     middle = np.array([(x + PATCH / 2 - 0.5, y + PATCH / 2 - 0.5) for y, x in corners])
     inner = np.arange(PATCH // 4, 3 * PATCH // 4, SPARSE)
     ys, xs = np.array(corners).T[..., None, None] + inner
     near = depth[ys.swapaxes(1, 2), xs].reshape(len(corners), -1)
     own = np.median(near, axis=1).astype(np.float64)
     j = interaction_matrix(middle[:, 0], middle[:, 1], own, camera)
-    return np.asarray(j @ axes)
+    return np.asarray(rows_matrix(j, middle[:, 1], camera) @ axes)
 
 
 def motion_axes(depth: FloatImage, camera: CameraIntrinsics) -> Vector:
     """
-    Give G (6, 6): p = G q with q in pixels: two shifts, roll, zoom, and two parallaxes.
+    Give G (9, 9): p = G q with q in pixels: two shifts, roll, zoom, two parallaxes, three by rows.
 
     A shift is a rotation that moves the middle by 1 px, roll and zoom move the corner by 1 px, a
     parallax is a translation with the rotation that keeps the mean depth in place, scaled so that
-    depth's spread moves 1 px.
+    depth's spread moves 1 px. By rows: shifts and roll that are 1 px more in the last row than in
+    the first.
     """
     w = 1 / depth.astype(np.float64)
     mean, spread = float(w.mean()), max(float(w.std()), 0.02 * float(w.mean()))
     corner = 0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy)
-    g = np.zeros((6, 6))
+    g = np.zeros((9, 9))
     g[1, 0], g[0, 1] = 1 / camera.fx, -1 / camera.fy
     g[2, 2] = 1 / (corner * camera.fx)
     g[5, 3] = -1 / (corner * mean * camera.fx)
     g[3, 4], g[1, 4] = 1 / (spread * camera.fx), -mean / (spread * camera.fx)
     g[4, 5], g[0, 5] = 1 / (spread * camera.fy), mean / (spread * camera.fy)
+    g[6:, 6:] = camera.fy / camera.height * g[:3, :3]
     return g
 
 
@@ -197,12 +200,13 @@ def thinned(evidence: Evidence) -> Evidence:
 
 
 def scores(qs: Vector, evidence: Evidence) -> Vector:
-    """Give S of the motions q (m, 6) [px]."""
-    e, count = evidence, len(qs)
-    padded = np.zeros((6, -(-count // WIDTH) * WIDTH), np.float32)
+    """Give S of the motions q (m, 6) or (m, 9) [px]."""
+    e, (count, size) = evidence, qs.shape
+    padded = np.zeros((size, -(-count // WIDTH) * WIDTH), np.float32)
     padded[:, :count] = qs.T
     c, d = np.zeros(padded.shape[1], np.float32), np.full(padded.shape[1], EVEN, np.float32)
-    match, flows = e.match.reshape(len(e.match), -1), e.flow_of_q.reshape(-1, 12)
+    match = e.match.reshape(len(e.match), -1)
+    flows = np.ascontiguousarray(e.flow_of_q[..., :size]).reshape(-1, 2 * size)
     table = (e.energy.reshape(-1), e.sag.reshape(-1))
     told = (padded.reshape(-1), match, *table, e.weight, flows, c, d)
     if c.size <= FEW:
@@ -214,13 +218,18 @@ def scores(qs: Vector, evidence: Evidence) -> Vector:
 
 @njit(cache=True, nogil=True, inline='always')
 def _flow(row, q, i, step):  # type: ignore[no-untyped-def]
-    """Give one row (6,) of J G times q, for sixteen motions from the i-th on."""
+    """Give one row of J G times q, for sixteen motions from the i-th on."""
     flow = splat(row[0]) * load(q, i)
     flow += splat(row[1]) * load(q, i + step)
     flow += splat(row[2]) * load(q, i + 2 * step)
     flow += splat(row[3]) * load(q, i + 3 * step)
     flow += splat(row[4]) * load(q, i + 4 * step)
-    return flow + splat(row[5]) * load(q, i + 5 * step)
+    flow += splat(row[5]) * load(q, i + 5 * step)
+    if len(row) > 6:
+        flow += splat(row[6]) * load(q, i + 6 * step)
+        flow += splat(row[7]) * load(q, i + 7 * step)
+        flow += splat(row[8]) * load(q, i + 8 * step)
+    return flow
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -237,7 +246,8 @@ def _add_patch(first, end, q, match, energy, sag, weight, flow, c, d):  # type: 
     zero, one, reach = splat(np.float32(0)), splat(np.float32(1)), splat(np.float32(REACH))
     w = splat(weight)
     for i in range(first, end, WIDTH):
-        u, v = _flow(flow[:6], q, i, c.size), _flow(flow[6:], q, i, c.size)
+        half = len(flow) // 2
+        u, v = _flow(flow[:half], q, i, c.size), _flow(flow[half:], q, i, c.size)
         u, v = where_positive(v, u, zero - u), larger(v, zero - v)
         inside = reach - larger(v, larger(u, zero - u))
         u, v = where_positive(inside, u + reach, zero), where_positive(inside, v, zero)
@@ -256,14 +266,14 @@ def _add_patch(first, end, q, match, energy, sag, weight, flow, c, d):  # type: 
 
 @njit(cache=True, nogil=True)
 def _add_some(first, end, q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
-    """Add the patches' C and D at motions `first` to `end` of q (6 * m,); flat but B first."""
+    """Add the patches' C and D at motions `first` to `end` of q (n * m,); flat but B first."""
     for b in range(len(weight)):
         _add_patch(first, end, q, match[b], energy, sag, weight[b], flows[b], c, d)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _add_all(q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
-    """Add the patches' C and D at motions q (6 * m,) to c and d (m,)."""
+    """Add the patches' C and D at motions q (n * m,) to c and d (m,)."""
     for k in prange(-(-c.size // CHUNK)):
         end = min((k + 1) * CHUNK, c.size)
         _add_some(k * CHUNK, end, q, match, energy, sag, weight, flows, c, d)

@@ -46,12 +46,20 @@ def interaction_matrix(x: Array, y: Array, depth: Array, camera: CameraIntrinsic
     )
 
 
+def rows_matrix(j: Array, y: Array, camera: CameraIntrinsics) -> Array:
+    """Continue J (..., 2, 6) of pixels in rows y to (..., 2, 9), for p by rows."""
+    yn = (y - camera.cy) / camera.fy
+    return np.concatenate([j, yn[..., None, None] * j[..., :3]], -1)
+
+
 def flow(
     p: npt.ArrayLike, depth: npt.NDArray[np.floating], camera: CameraIntrinsics
 ) -> FloatImage:
-    """Give the first-order flow (H, W, 2) [px] of motion p (6,); depth (H, W) [m]."""
-    tx, ty, tz, vx, vy, vz = (float(value) for value in np.asarray(p, np.float64))
-    xn, yn = normalised_grid(camera)
+    """Give the first-order flow (H, W, 2) [px] of p (6,) or (9,), by rows; depth (H, W) [m]."""
+    vector, xn, yn = np.zeros(9), *normalised_grid(camera)
+    vector[: len(np.asarray(p))] = p
+    tx, ty, tz = vector[:3, None, None] + vector[6:, None, None] * yn
+    vx, vy, vz = vector[3:6].tolist()
     w = 1 / depth
     fx = camera.fx * (-xn * yn * tx + (1 + xn * xn) * ty - yn * tz + w * (vx - xn * vz))
     fy = camera.fy * (-(1 + yn * yn) * tx + xn * yn * ty + xn * tz + w * (vy - yn * vz))

@@ -6,7 +6,8 @@ The spectra (start.py) tell the motion to half a pixel and cannot go far wrong; 
 disagree by more than chance, their word counts for less and the start's for more,
 docs/method.md (19).
 
-Notation: p (6,) motion; g_k, H_k slope and curvature of part k; C_0 the start's covariance.
+Notation: p (9,) motion by rows; g_k, H_k slope and curvature of part k; C_0 the start's
+covariance.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vec
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+from depth_deblur_ros.core.start import Start
 from numba import (  # type: ignore[attr-defined]
     get_num_threads,
     set_num_threads,
@@ -48,24 +50,23 @@ def refine(
     light: FloatImage,
     depth: FloatImage,
     camera: CameraIntrinsics,
-    start: Motion,
+    start: Start,
     budget: int,
 ) -> Motion:
     """
     Give the motion, with its covariance, that makes blurred grey light (H, W) likeliest.
 
-    depth (H, W) filled [m]; start: from the spectra, with its covariance, which takes part;
+    depth (H, W) filled [m]; start: what the spectra tell, whose covariance takes part;
     budget: px that are looked at.
     """
-    assert start.covariance is not None
 
     def length(p: Vector) -> float:
         return blur_length(p, depth, camera)
 
-    certainty = np.asarray(np.linalg.inv(start.covariance), np.float64)
-    parts = _parts(light, depth, camera, length(start.vector), budget)
-    begun = _each(lambda part: _begun(part, start.vector), parts)
-    return _moved(begun, start.vector, certainty, length)
+    p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
+    parts = _parts(light, depth, camera, length(p), budget)
+    begun = _each(lambda part: _begun(part, p), parts)
+    return _moved(begun, p, certainty, length)
 
 
 def _moved(
@@ -88,7 +89,7 @@ def _moved(
             break
         last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
-    return Motion.from_vector(p, np.linalg.inv(bend / soft + certainty))
+    return Motion.from_vector(p, np.linalg.inv(bend / soft + certainty)[:6, :6])
 
 
 def _slope(part: Part, p: Vector) -> Vector:
@@ -117,15 +118,15 @@ def _each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]
 
 
 def _softening(gs: Vector, bends: Vector) -> float:
-    """Give by how much the parts (n, 6), (n, 6, 6) are off their common optimum, in chi^2."""
+    """Give by how much the parts (n, 9), (n, 9, 9) are off their common optimum, in chi^2."""
     common = -np.linalg.solve(bends.sum(0), gs.sum(0))
     left = gs + bends @ common
     chi = float(np.sum(left * np.linalg.solve(bends, left[..., None])[..., 0]))
-    return max(SOFTEST, DISSENT * chi / (6 * (len(gs) - 1)))
+    return max(SOFTEST, DISSENT * chi / float(gs[1:].size))
 
 
 def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
-    """Correct the curvature (6, 6) by how a move changed the slope, within BENDS of the first."""
+    """Correct the curvature (9, 9) by how a move changed the slope, within BENDS of the first."""
     rest = change - bend @ move
     weight = float(rest @ move)
     if abs(weight) > 1e-8 * float(np.linalg.norm(rest) * np.linalg.norm(move)):

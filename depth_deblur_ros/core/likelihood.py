@@ -94,7 +94,7 @@ def settled(part: Part, p: Vector) -> Posterior:
 
 
 def posterior(part: Part, p: Vector) -> Posterior:
-    """Find mu and two samples s for a motion p (6,)."""
+    """Find mu and two samples s for a motion p (9,), by rows."""
     return _posterior(part, p, follow=False)
 
 
@@ -206,27 +206,36 @@ def _link(problem: Quadratic, k: int, here: Places, there: Places) -> FloatImage
 
 
 def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
-    """Give g (6,), (16), and J mu (H, W, 6)."""
+    """Give g (9,), (16), and J mu (H, W, 9), by rows."""
     blur, part = found.blur, found.part
     latent = np.ascontiguousarray(np.moveaxis(blur.latent_part(found.latent), 0, 2))
     missing, slope = blur_and_slope(blur.motion[:6].astype(np.float64), latent, blur)
     missing[..., 0] -= part.light
     missing *= part.trust[..., None] * np.array([1, 0.5, 0.5], np.float32)
     # einsum, not BLAS, whose threads spin for long after such short work.
-    g = np.einsum('nk,n->k', slope.reshape(-1, 6), missing.reshape(-1), dtype=np.float64)
-    return g / part.scales.sigma**2, slope[..., 0, :]
+    g = np.einsum('ynk,yn->yk', _flat(slope), _flat(missing), dtype=np.float64)
+    yn = blur.ray[-len(g) :].astype(np.float64)
+    force = np.concatenate([g.sum(0), yn @ g[:, :3]]) / part.scales.sigma**2
+    own = slope[..., 0, :]
+    return force, np.concatenate([own, yn[:, None, None].astype(own.dtype) * own[..., :3]], -1)
+
+
+def _flat(rows: FloatImage) -> FloatImage:
+    """Give (H, W, 3, ...) as (H, 3 W, ...)."""
+    return rows.reshape(len(rows), -1, *rows.shape[3:])
 
 
 def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
-    """Give <J, W (J - A z)> / sigma^2 (6, 6), z how mu answers to a change of p [K75], (17)."""
+    """Give <J, W (J - A z)> / sigma^2 (9, 9), z how mu answers to a change of p [K75], (17)."""
     sweep, width = found.blur.sweep, slope.shape[1]
     rest = np.empty_like(slope)
-    for half in (slice(0, 3), slice(3, 6)):
-        columns = sweep.blurred_planes(slope[..., half])
+    for first in (0, 3, 6):
+        some = slice(first, first + 3)
+        columns = sweep.blurred_planes(slope[..., some])
         push = sweep.adjoint(found.problem.trust * columns)
         z = conjugate_gradients(found.problem, np.zeros_like(push), push, STEPS)
         answered = columns - sweep.gather(z, np.ones_like(columns))
-        rest[..., half] = np.moveaxis(answered, 0, 2)[:, :width]
+        rest[..., some] = np.moveaxis(answered, 0, 2)[:, :width]
     weighted = found.part.trust[..., None] * slope
-    h = np.einsum('ni,nj->ij', weighted.reshape(-1, 6), rest.reshape(-1, 6), dtype=np.float64)
+    h = np.einsum('ni,nj->ij', weighted.reshape(-1, 9), rest.reshape(-1, 9), dtype=np.float64)
     return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2

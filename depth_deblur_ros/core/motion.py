@@ -181,8 +181,9 @@ def blur_and_slope(p: Vector, latent: Array, blur: BlurOperator) -> tuple[Array,
     """Give A_p L (H, W, 3) and its slope (H, W, 3, 6) in p; what is seen when stays as in blur."""
     shape = (*blur.inverse_depth.shape[:2], 3)
     value, slope = np.empty(shape, latent.dtype), np.empty((*shape, 6), latent.dtype)
-    focal = blur.motion[6:8].astype(np.float64)
-    _blur_and_slope(latent, blur.inverse_depth, blur.ray, p, focal, blur.margin, value, slope)
+    focal, rolling = np.split(blur.motion[6:].astype(np.float64), [2])
+    whole = np.concatenate([p[:6], rolling])
+    _blur_and_slope(latent, blur.inverse_depth, blur.ray, whole, focal, blur.margin, value, slope)
     return value, slope
 
 
@@ -193,9 +194,10 @@ def _blur_and_slope(latent, seen, ray, p, focal, margin, value, slope):  # type:
         lean = np.zeros((3, 5))  # of each channel: value, then dL times t and t w down each axis
         for x in range(width):
             xn, yn = np.float64(ray[x]), np.float64(ray[width + y])
+            tx, ty, tz = p[0] + yn * p[6], p[1] + yn * p[7], p[2] + yn * p[8]
             flow = (
-                focal[0] * (-xn * yn * p[0] + (1 + xn * xn) * p[1] - yn * p[2]),
-                focal[1] * (-(1 + yn * yn) * p[0] + xn * yn * p[1] + xn * p[2]),
+                focal[0] * (-xn * yn * tx + (1 + xn * xn) * ty - yn * tz),
+                focal[1] * (-(1 + yn * yn) * tx + xn * yn * ty + xn * tz),
                 focal[0] * (p[3] - xn * p[5]),
                 focal[1] * (p[4] - yn * p[5]),
             )

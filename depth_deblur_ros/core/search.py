@@ -7,7 +7,8 @@ search; all scales together choose, since a false optimum at one scale seldom is
 Short blurs are looked at again with the picture's middle at twice its size, where bands up to
 the finest frequency count. docs/method.md (11), (12).
 
-Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes).
+Notation: q (6,) or (9,), with turns that rows see differently, motion in pixels, p = G q
+(evidence.motion_axes).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ SHARE = {
     4: 0.25,
 }  # of a scale in the common score: coarse bands are deep but inexact
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
+ROLLING_COST = 0.07  # of S per squared change from first to last row over the squared length
 FEW = 4  # patches; a coarse scale with less has no vote
 MANY = 40  # patches of a scale, of which half are heard on all proposals
 HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that all patches judge; that seeds are of
@@ -37,8 +39,13 @@ SEEDS = 8  # distinct motions that each scale refines
 NEAR = 3.0  # px; how wide it is searched around a guess
 DEEPER = 1.08  # times as deep bands make twice a motion likelier
 ROOM = 10  # px of templates around the guess, more than the search around it goes
-SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0)  # of the search along each axis of q
+SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
+DESCENTS, FLATTEST = 2, 1e-3  # Newton's steps; least share of the largest curvature
+ALONG = (0.2, 0.4, 0.7, 1.0, 1.4)  # of such a step are tried
+LAST_RADIUS = 0.5  # px
+BEND = 1.0  # px, step of the differences
+_CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 SATURATED = 0.98
 CLOSE_SIDES = (240, 320)  # px, rows and columns of the middle that is seen close up, at least
 CLOSE_REACH = 12  # px of templates around no motion, at full scale
@@ -55,7 +62,7 @@ class Scale:
 
 
 def find(spectra: dict[int, Spectra], guess: Vector | None) -> tuple[Vector, list[Scale]]:
-    """Let each scale propose and all choose; q (6,), and what the scales say of all motions."""
+    """Let each scale propose and all choose; q (9,), and what the scales say of all motions."""
     scales = _scales(spectra)
     return _search(scales, guess), scales
 
@@ -69,28 +76,29 @@ def ask_twice(q: Vector, scales: list[Scale]) -> tuple[Vector, list[Scale]]:
     coarse = scales[1:]
     if not coarse:
         return q, scales
-    twice = _refine(_refine(2 * q[None], coarse, 2 * NEAR), coarse, 1.0)[0]
+    twice = _settled(2 * q, coarse, 2 * NEAR)
     one, other = common_score(np.array([q, twice]), coarse)
     return (twice, coarse) if other < DEEPER * one else (q, scales)
 
 
 def find_near(spectra: dict[int, Spectra], guess: Vector) -> tuple[Vector, list[Scale]]:
-    """Find q (6,) around a guess, and what the scales say of the motions there."""
+    """Find q (9,) around a guess (9,), and what the scales say of the motions there."""
     scales = _scales(spectra, guess)
-    return _refine(_refine(guess[None], scales, NEAR), scales, 1.0)[0], scales
+    return _settled(guess, scales, NEAR), scales
 
 
 def find_short(scale: Scale, spectra: Spectra, near: Vector | None) -> tuple[Vector, list[Scale]]:
     """
-    Find a short q (6,), at full scale and close up, around one if it is known.
+    Find a short q (9,), at full scale and close up, around one if it is known.
 
-    scale: of the full picture; spectra: what `close_up` saw.
+    scale: of the full picture; spectra: what `close_up` saw. No row sees another turn: of so short
+    a blur that is too little to show.
     """
-    around, room = (np.zeros(6), CLOSE_REACH) if near is None else (near, ROOM)
+    around, room = (np.zeros(9), CLOSE_REACH) if near is None else (near, ROOM)
     both = [scale, Scale(CLOSE, spectra.evidence_around(around, round(room / CLOSE)))]
     known = near is not None
-    found = _refine(around[None], both, NEAR) if known else _best(_short(), both, CLOSE_SEEDS)
-    found = _refine(found, both, 1.0)
+    found = _refine(around[None, :6], both, NEAR) if known else _best(_short(), both, CLOSE_SEEDS)
+    found = _by_rows(_refine(found, both, 1.0))
     return found[int(np.argmin(common_score(found, both)))], both
 
 
@@ -158,19 +166,56 @@ def _whole(grey: FloatImage) -> FloatImage:
 
 
 def common_score(qs: Vector, scales: list[Scale]) -> Vector:
-    """Give the score (m,) of motions q (m, 6) over all scales, with the price of parallax."""
+    """Give the score (m,) of motions q (m, n) over all scales; parallax and rows have a price."""
     total = PARALLAX_COST * (qs[:, 4] ** 2 + qs[:, 5] ** 2)
+    if qs.shape[1] > 6:
+        length = np.square(qs[:, :4]).sum(1)
+        total += ROLLING_COST * np.square(qs[:, 6:]).sum(1) / (1 + length)
     for scale in scales:
         total = total + SHARE[scale.factor] * scores(qs, scale.evidence)
     return np.asarray(total)
 
 
 def _search(scales: list[Scale], guess: Vector | None) -> Vector:
-    """Let each scale propose and all choose; q (6,)."""
-    found = [] if guess is None else [guess]
+    """Let each scale propose and all choose; q (9,)."""
+    found = [] if guess is None else [guess[:6]]
     for scale in scales:
         found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor))
-    return np.asarray(_refine(_choose(np.array(found), scales)[None], scales, 1.0)[0])
+    return _settled(_by_rows(_choose(np.array(found), scales)[None])[0], scales, NEAR)
+
+
+def _settled(q: Vector, scales: list[Scale], radius: float) -> Vector:
+    """Search around one of q (9,), then go down to the bottom; radius [px]."""
+    q = _refine(q[None], scales, radius)[0]
+    best = common_score(q[None], scales)[0]
+    for _ in range(DESCENTS):
+        slope, bend = slope_and_bend(q, scales)
+        values, vectors = np.linalg.eigh(bend)
+        steep = np.maximum(np.abs(values), FLATTEST * np.abs(values).max())
+        step = -vectors @ (vectors.T @ slope / steep)
+        step *= min(1.0, radius / max(np.abs(step).max(), 1e-9))
+        tries = q + np.outer(ALONG, step)
+        told = common_score(tries, scales)
+        k = int(np.argmin(told))
+        if told[k] >= best:
+            break
+        q, best = tries[k], told[k]
+    return np.asarray(_refine(q[None], scales, LAST_RADIUS)[0])
+
+
+def slope_and_bend(q: Vector, scales: list[Scale]) -> tuple[Vector, Vector]:
+    """Give slope (9,) and curvature (9, 9) of the common score at q, by differences."""
+    steps = BEND * np.eye(q.size)
+    corners = [q + a * one + b * other for one in steps for other in steps for a, b in _CORNERS]
+    value = common_score(np.array(corners), scales).reshape(q.size, q.size, 4)
+    bend = value @ np.array([1, -1, -1, 1]) / (4 * BEND**2)
+    sides = common_score(np.concatenate([q + steps, q - steps]), scales)
+    return (sides[: q.size] - sides[q.size :]) / (2 * BEND), bend
+
+
+def _by_rows(qs: Vector) -> Vector:
+    """Let rows see different turns: q (m, 9) of (m, 6), or of themselves."""
+    return np.pad(qs, [(0, 0), (0, 9 - qs.shape[1])])
 
 
 def _choose(qs: Vector, scales: list[Scale]) -> Vector:
@@ -222,17 +267,17 @@ def _best(qs: Vector, scales: list[Scale], count: int) -> Vector:
 
 @lru_cache(maxsize=1)
 def _steps() -> Vector:
-    """Give the steps (ROUNDS, TRIES, 6) of the shrinking search, in units of its radius."""
-    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 6)) * SPREAD
+    """Give the steps (ROUNDS, TRIES, 9) of the shrinking search, in units of its radius."""
+    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 9)) * SPREAD
     return np.asarray(steps * SHRINK ** np.arange(ROUNDS)[:, None, None])
 
 
 def _refine(qs: Vector, scales: list[Scale], radius: float) -> Vector:
-    """Shrinking random search around each of qs (n, 6), the same each time; radius [px]."""
-    best, each = common_score(qs, scales), np.arange(len(qs))
+    """Shrinking random search around each of qs (n, 6 or 9), the same each time; radius [px]."""
+    best, each, size = common_score(qs, scales), np.arange(len(qs)), qs.shape[1]
     for steps in _steps():
-        tries = qs[:, None] + radius * steps
-        values = common_score(tries.reshape(-1, 6), scales).reshape(len(qs), -1)
+        tries = qs[:, None] + radius * steps[:, :size]
+        values = common_score(tries.reshape(-1, size), scales).reshape(len(qs), -1)
         k = np.argmin(values, 1)
         better = values[each, k] < best
         best = np.where(better, values[each, k], best)

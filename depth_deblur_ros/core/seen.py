@@ -33,11 +33,12 @@ def nearness_of(depth: FloatImage) -> FloatImage:
 
 
 def pack(motion: Motion, camera: CameraIntrinsics) -> tuple[FloatImage, FloatImage]:
-    """Give the rays (W + H,), xn of columns and yn of rows, and (theta, v, fx, fy), float32."""
+    """Give the rays (W + H,), xn and yn, and (theta, v, fx, fy, rolling) (11,), float32."""
     cols = (np.arange(camera.width) - camera.cx) / camera.fx
     rows = (np.arange(camera.height) - camera.cy) / camera.fy
     ray = np.concatenate([cols, rows]).astype(np.float32)
-    return ray, np.concatenate([motion.vector, [camera.fx, camera.fy]]).astype(np.float32)
+    focal = [camera.fx, camera.fy]
+    return ray, np.concatenate([motion.vector, focal, motion.rolling]).astype(np.float32)
 
 
 def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> FloatImage:
@@ -46,7 +47,8 @@ def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> F
     beyond = ray[width - 1] + (ray[1] - ray[0]) * np.arange(1, whole_blocks(width) - width + 1)
     xn = np.concatenate([ray[:width], beyond])[None].astype(np.float32)
     yn = ray[width:, None]
-    tx, ty, tz, vx, vy, vz, fx, fy = motion
+    tx, ty, tz = motion[:3, None, None] + motion[8:, None, None] * yn
+    vx, vy, vz, fx, fy = motion[3:8]
     parts = np.empty((height, 4, xn.size), np.float32)
     parts[:, 0] = fx * ((1 + xn * xn) * ty - (tx * xn + tz) * yn)
     parts[:, 1] = fy * ((ty * yn + tz) * xn - (1 + yn * yn) * tx)

@@ -33,7 +33,7 @@ def sharp_sequence(
     views = []
     for i in range(frames):
         t = np.float32((i + 0.5) / frames - 0.5)
-        f = flow(motion.vector, 1 / seen[..., i], camera)
+        f = flow(motion.by_rows, 1 / seen[..., i], camera)
         from_x, from_y = x - t * f[..., 0], y - t * f[..., 1]
         view = cv2.remap(image, from_x, from_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         views.append(np.clip(np.asarray(view, np.float32), 0, 1))

@@ -85,7 +85,7 @@ def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, budget: int) -> 
         return calibrated(found.motion, found.axes, OF_SPECTRA)
     light = light_from_stored(frame.image, frame.camera.transfer)
     light = _grey(light, _shares(frame.image))
-    motion = refine(light, depth, frame.camera, found.motion, budget)
+    motion = refine(light, depth, frame.camera, found, budget)
     return calibrated(motion, found.axes, OF_LIKELIHOOD)
 
 
@@ -112,7 +112,7 @@ def _finish(
         outcome=found.outcome,
         sign_resolved=False,
         quality=found.quality,
-        blur_px=blur_length(found.motion.vector, depth, frame.camera),
+        blur_px=blur_length(found.motion.by_rows, depth, frame.camera),
         seconds=time.monotonic() - began,
     )
 

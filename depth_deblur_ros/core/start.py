@@ -4,7 +4,8 @@ The blind start: the first motion, out of one blurred image, and whether to beli
 search.py finds what the spectra fit best; here it is decided whether that is a motion, a sharp
 picture or nothing to trust. docs/method.md (13), (14).
 
-Notation: q (6,) motion in pixels, p = G q (evidence.motion_axes); length = mean blur [px].
+Notation: q (9,) motion in pixels, by rows, p = G q (evidence.motion_axes); length = mean
+blur [px].
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from depth_deblur_ros.core.search import (
     look,
     Scale,
     SHARE,
+    slope_and_bend,
 )
 from depth_deblur_ros.core.trust import covariance_from_curvature, Edges
 import numpy as np
@@ -59,17 +61,21 @@ BELIEF = 0.4  # common -S at which a motion is taken for certain
 LONELY, LONELY_SPREAD = 0.45, 25.0
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
-BEND = 1.0  # px, step of the second differences
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The first motion (zero unless solved) and its covariance, what it is worth, and axes G."""
+    """
+    The first motion (zero unless solved), what it is worth, and axes G.
+
+    spread (9, 9): covariance of the motion by rows.
+    """
 
     motion: Motion
     outcome: Outcome
     quality: float
-    axes: Vector = field(default_factory=lambda: np.eye(6))
+    axes: Vector = field(default_factory=lambda: np.eye(9))
+    spread: Vector = field(default_factory=lambda: np.zeros((9, 9)))
 
 
 def blind_start(
@@ -95,7 +101,7 @@ def blind_start(
     def length(q: Vector) -> float:
         return blur_length(axes @ q, depth, camera)
 
-    first = np.asarray(np.linalg.solve(axes, guess.vector)) if guess else None
+    first = np.asarray(np.linalg.solve(axes, guess.by_rows)) if guess else None
     q, scales = _found(spectra, first, length, edges)
     trusted = _trusted(q, length(q), scales, edges)
     look_closer = length(q) < CLOSE_BELOW if trusted else edges.along > EDGED
@@ -114,7 +120,8 @@ def blind_start(
         covariance = LONELY_SPREAD * covariance
     if scales[-1].factor == CLOSE:
         q = q * math.sqrt(1 - (CLOSE_BIAS / length(q)) ** 2)
-    return Start(Motion.from_vector(axes @ q, covariance), Outcome.SOLVED, quality, axes)
+    motion = Motion.from_vector(axes @ q, covariance[:6, :6])
+    return Start(motion, Outcome.SOLVED, quality, axes, covariance)
 
 
 def _found(
@@ -157,20 +164,13 @@ def _short_trusted(q: Vector, length: float, both: list[Scale]) -> bool:
 def _nothing(outcome: Outcome, axes: Vector) -> Start:
     """Give no motion: still to within SHORTEST when sharp, anything when failed."""
     spread = SHORTEST / 2 if outcome is Outcome.SHARP else PRIOR_PX
-    covariance = spread**2 * axes @ axes.T
+    covariance = spread**2 * axes[:6, :6] @ axes[:6, :6].T
     quality = 1.0 if outcome is Outcome.SHARP else 0.0
     return Start(Motion.from_vector(np.zeros(6), covariance), outcome, quality)
 
 
 def _covariance(q: Vector, scales: list[Scale], axes: Vector) -> Vector:
-    """Give the covariance (6, 6) of p from how S^2 / 2 bends around q."""
-    steps = BEND * np.eye(6)
-    tries = [
-        q + a * steps[i] + b * steps[j] for i in range(6) for j in range(6) for a, b in _SIGNS
-    ]
-    value = np.square(np.minimum(common_score(np.array(tries), scales), 0)) / 2
-    bend = -(value.reshape(6, 6, 4) @ np.array([1, -1, -1, 1])) / (4 * BEND**2)
+    """Give the covariance (9, 9) of p by rows from how S^2 / 2 bends around q."""
+    score, (_, bend) = float(common_score(q[None], scales)[0]), slope_and_bend(q, scales)
+    bend = max(-score, 0.0) * bend
     return np.asarray(axes @ covariance_from_curvature(bend, OBSERVATIONS, PRIOR_PX) @ axes.T)
-
-
-_SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))

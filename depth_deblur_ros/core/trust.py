@@ -9,7 +9,7 @@ docs/method.md (13), (14).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
@@ -96,7 +96,7 @@ def _rms(values: FloatImage) -> float:
 
 def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -> Vector:
     """
-    Give the covariance (6, 6) [px^2] of q where S^2 / 2 bends by -curvature (6, 6).
+    Give the covariance (n, n) [px^2] of q where S^2 / 2 bends by -curvature (n, n).
 
     gain: how many independent observations S^2 is made of; directions that the image does not show
     keep the prior's spread.
@@ -109,5 +109,6 @@ def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -
 
 def calibrated(motion: Motion, axes: Vector, share: float) -> Motion:
     """Give the motion with a covariance as large as its errors are; axes G, share of the old."""
-    least = axes @ np.diag(np.square(LEAST_ERROR)) @ axes.T
-    return Motion.from_vector(motion.vector, share * motion.covariance + least)
+    own = axes[:6, :6]
+    least = own @ np.diag(np.square(LEAST_ERROR)) @ own.T
+    return replace(motion, covariance=share * motion.covariance + least)
