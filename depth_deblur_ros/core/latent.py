@@ -82,7 +82,8 @@ def restore_coarse_to_fine(
     sigma = math.hypot(noise_sigma(blurred), block_sigma(blurred))
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
     steps = replace(steps, inner=math.ceil(worth * steps.inner))
-    return _restored(blurred, depth, motion, camera, (sigma, steps))
+    light = _restored(blurred, depth, motion, camera, (sigma, steps))
+    return stored_from_light(light, camera.transfer)
 
 
 def _restored(
@@ -92,7 +93,7 @@ def _restored(
     camera: CameraIntrinsics,
     effort: tuple[float, LatentSteps],
 ) -> FloatImage:
-    """Restore from the image of half the size, as long as there is one; effort: noise, steps."""
+    """Restore light from that of half the size, as long as there is one; effort: noise, steps."""
     first, (sigma, steps) = None, effort
     width, height = camera.width // 2, camera.height // 2
     if min(width, height) >= MIN_SIDE:
@@ -101,16 +102,25 @@ def _restored(
         coarse = LatentSteps(steps.prior, COARSE_OUTER, round(COARSE_LONGER * steps.inner))
         # Four pixels in one: half the noise.
         half = _restored(small, near, motion, camera.scaled(width, height), (sigma / 2, coarse))
-        first = np.clip(_resized(half, camera.width, camera.height, cv2.INTER_CUBIC), 0, 1)
+        first = _magnified(half, camera)
     blur = blur_operator(motion, depth, camera, SPACING)
-    return restore_latent(blurred, blur, camera.transfer, sigma, steps, first=first)
+    return restored_light(blurred, blur, camera.transfer, sigma, steps, first=first)
+
+
+def _magnified(light: FloatImage, camera: CameraIntrinsics) -> FloatImage:
+    """Give light at a camera's size; what is brighter than can be stored stays so."""
+    size, transfer = (camera.width, camera.height), camera.transfer
+    stored = _resized(stored_from_light(light, transfer), *size, cv2.INTER_CUBIC)
+    within = light_from_stored(np.clip(stored, 0, 1), transfer)
+    beyond = np.maximum(light - 1, 0)
+    return within + _resized(beyond, *size, cv2.INTER_LINEAR) if beyond.any() else within
 
 
 def _resized(image: FloatImage, width: int, height: int, how: int) -> FloatImage:
     return np.asarray(cv2.resize(image, (width, height), interpolation=how), np.float32)
 
 
-def restore_latent(
+def restored_light(
     blurred: FloatImage,
     blur: BlurOperator,
     transfer: str,
@@ -119,13 +129,17 @@ def restore_latent(
     *,
     first: FloatImage | None = None,
 ) -> FloatImage:
-    """Give the sharp image (H, W, 3), stored values, of one under a known blur; first: a guess."""
+    """
+    Give the sharp light (H, W, 3) of stored values under a known blur; first: a guess.
+
+    Where blurred values are saturated it may exceed 1.
+    """
     sweep, (height, width) = blur.sweep, blurred.shape[:2]
     stored = sweep.blurred_planes(blurred)
     light = light_from_stored(stored, transfer)
     full, noise = stored >= SATURATED, 1 / np.square(light_slope(stored, transfer))
     noise[:, :, width:] = 0
-    start = light[:, :, :width] if first is None else _light_planes(first, transfer)
+    start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
     within = sweep.blurred_planes(np.ones_like(blurred))
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
@@ -136,12 +150,7 @@ def restore_latent(
         problem = reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
         latent = conjugate_gradients(problem, latent, problem.slope(missing, latent), steps.inner)
     r = sweep.room
-    sharp = stored_from_light(latent[:, r : r + height, r : r + width], transfer)
-    return np.ascontiguousarray(np.moveaxis(sharp, 0, 2))
-
-
-def _light_planes(stored: FloatImage, transfer: str) -> FloatImage:
-    return light_from_stored(np.ascontiguousarray(np.moveaxis(stored, 2, 0)), transfer)
+    return np.ascontiguousarray(np.moveaxis(latent[:, r : r + height, r : r + width], 0, 2))
 
 
 @dataclass(frozen=True, eq=False)
