@@ -17,15 +17,9 @@ from depth_deblur_ros.core.data import (
     Outcome,
     RgbdFrame,
 )
-from depth_deblur_ros.core.latent import (
-    EPSILON,
-    EXPONENT,
-    noise_sigma,
-    SATURATED,
-    SIGMA_FLOOR,
-    SPACING,
-)
+from depth_deblur_ros.core.latent import noise_sigma, SATURATED, SIGMA_FLOOR, SPACING
 from depth_deblur_ros.core.light import light_from_stored, light_slope
+from depth_deblur_ros.core.quadratic import EPSILON, EXPONENT
 import numpy as np
 
 GREY_LEVELS = 255.0

@@ -53,22 +53,50 @@ def fill_uncovered(view, nearness):
 
 def displacements(blur):
     """Give (dx, dy), (H, W, N) each: how far [px] from its own place each pixel reads at t_i."""
-    width, samples = blur.inverse_depth.shape[1:]
+    flow_x, flow_y = flows(blur)
+    t = instants(flow_x.shape[2])
+    return -t * flow_x, -t * flow_y
+
+
+def thinned_displacements(blur, spacing):
+    """Give as `displacements`, each block of 16 columns at instants of its own, and weights."""
+    flow_x, flow_y = flows(blur)
+    height, width, samples = flow_x.shape
+    places, weights = np.zeros((2, height, width, samples)), np.zeros(flow_x.shape)
+    for y, left in np.ndindex(height, width // 16):
+        block = np.s_[y, 16 * left : 16 * left + 16]
+        longest = np.hypot(flow_x[block], flow_y[block]).max()
+        count = int(np.clip(np.ceil(longest / spacing), 3, samples))
+        for i, t in enumerate(instants(count)):
+            seen = int((i + 0.5) * samples / count)
+            places[(0, *block, i)] = -t * flow_x[(*block, seen)]
+            places[(1, *block, i)] = -t * flow_y[(*block, seen)]
+            weights[(*block, i)] = 1 / count
+    return *places, weights
+
+
+def flows(blur):
+    """Give the flow (x, y), (H, W, N) each, of what each pixel sees at each instant [px]."""
+    width = blur.inverse_depth.shape[1]
     vx, vy, vz, fx, fy = blur.motion[3:8].astype(np.float64)
     ray = blur.ray.astype(np.float64)
     xn, yn = ray[None, :width, None], ray[width:, None, None]
     tx, ty, tz = (blur.motion[k] + yn * blur.motion[8 + k] for k in range(3))
-    w, t = blur.inverse_depth.astype(np.float64), instants(samples)
+    w = blur.inverse_depth.astype(np.float64)
     flow_x = fx * (-xn * yn * tx + (1 + xn**2) * ty - yn * tz + w * (vx - xn * vz))
     flow_y = fy * (-(1 + yn**2) * tx + xn * yn * ty + xn * tz + w * (vy - yn * vz))
-    return -t * flow_x, -t * flow_y
+    return flow_x, flow_y
 
 
 def blur_matrix(blur):
     """Give A (H W, h w) of a BlurOperator, so that A @ latent is the blurred image."""
-    height, width, samples = blur.inverse_depth.shape
+    return matrix_of(blur, *displacements(blur), 1 / blur.inverse_depth.shape[2])
+
+
+def matrix_of(blur, dx, dy, share):
+    """Give A (H W, h w) that reads at these places, with these shares of the exposure."""
+    height, width, _ = blur.inverse_depth.shape
     high, wide, _ = blur.latent_shape
-    dx, dy = displacements(blur)
     y, x = np.indices((height, width))
     far = blur.margin - 1
     px = x[..., None] + blur.margin + np.clip(dx, -far, far)
@@ -77,7 +105,7 @@ def blur_matrix(blur):
     parts = []
     for down, right in np.ndindex(2, 2):
         cell_x, cell_y = np.floor(px) + right, np.floor(py) + down
-        weight = (1 - np.abs(px - cell_x)) * (1 - np.abs(py - cell_y)) / samples
+        weight = (1 - np.abs(px - cell_x)) * (1 - np.abs(py - cell_y)) * share
         parts.append((weight.ravel(), rows.ravel(), (cell_y * wide + cell_x).ravel()))
     values, i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
     return coo_matrix((values, (i, j.astype(int))), (height * width, high * wide)).tocsr()

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator, MAX_SAMPLES, MIN_SAMPLES
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.geometry import flow, normalised_grid
+from depth_deblur_ros.core.instants import FEWEST
 from depth_deblur_ros.core.seen import _fill_uncovered, _see, MIN_INVERSE_DEPTH
 from depth_deblur_ros.core.sweep import MANY
 from hypothesis import given, settings
@@ -195,6 +196,38 @@ def test_blocks_that_read_far_apart_are_their_slow_twins():
     np.testing.assert_allclose(there, oracle.through(matrix, latent, image.shape), atol=TOL)
     slow = oracle.through(matrix.T, image, latent.shape)
     np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
+
+
+@given(seed=seeds, spacing=st.floats(0.3, 4), count=threads)
+@few
+def test_a_thinned_operator_is_its_slow_twin(seed, spacing, count):
+    """Near boards move by many px, the wall behind by few: blocks have 3 to N instants."""
+    rng = np.random.default_rng(seed)
+    depth, v = steps_in_depth(rng, (48, 64)), rng.normal(0, 0.15, 3)
+    blur = blur_operator(Motion(rng.normal(0, 0.01, 3), v), depth, CAMERA)
+    matrix = oracle.matrix_of(blur, *oracle.thinned_displacements(blur, spacing))
+    latent, image = rng.random(blur.latent_shape, np.float32), rng.random((48, 64, 3), np.float32)
+    sweep = blur.thinned(spacing)
+    planes, taken = np.zeros(sweep.latent_shape, np.float32), sweep.blurred_planes(image)
+    blur.latent_part(planes)[:] = np.moveaxis(latent, 2, 0)
+    with on_threads(count):
+        there, back = sweep.gather(planes, np.ones_like(taken)), sweep.adjoint(taken)
+    slow = oracle.through(matrix, latent, image.shape)
+    np.testing.assert_allclose(np.moveaxis(there, 0, 2), slow, atol=TOL)
+    slow = oracle.through(matrix.T, image, latent.shape)
+    back = np.moveaxis(blur.latent_part(back), 0, 2)
+    np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
+
+
+def test_a_block_has_as_many_instants_as_its_own_blur_is_long():
+    depth = np.full((48, 64), 20, np.float32)
+    depth[:, 40:56] = 1.0
+    blur = blur_operator(Motion(np.zeros(3), [20 / 64, 0, 0]), depth, CAMERA)  # 20 px and 1 px
+    counts = np.rint(1 / blur.thinned(0.8).shares)
+    assert (counts[:, 0] == FEWEST).all()
+    assert (counts[:, 2:] == 20).all()
+    assert (np.rint(1 / blur.thinned(2.0).shares)[:, 2] == 10).all()
+    assert (np.rint(1 / blur.sweep.shares) == 20).all()
 
 
 @given(drawn=blurs())

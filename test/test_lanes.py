@@ -25,7 +25,8 @@ def calculate(a, b, at, out):
     lanes.store(out, 112, lanes.tent(x))
     lanes.store(out, 128, lanes.whole(x))
     lanes.store(out, 144, lanes.where_positive(x, x, y))
-    return lanes.last_lane(x), lanes.total(x, np.empty(16, np.float32))
+    ends = lanes.last_lane(x), lanes.least(x), lanes.greatest(x)
+    return ends, lanes.total(x, np.empty(16, np.float32))
 
 
 @given(pair=arrays, at=places)
@@ -33,13 +34,13 @@ def test_each_lane_calculates_by_itself(pair, at):
     a, b = pair
     x, y = (array[at : at + 16] for array in pair)
     out = np.full(10 * 16 + 1, 7, np.float32)
-    last, total = calculate(a, b, at, out)
+    ends, total = calculate(a, b, at, out)
     expected = [x + y, x - y, x * y, np.maximum(x, y), np.minimum(x, y), np.r_[0, x[:-1]]]
     expected += [np.full(16, y[0]), np.maximum(0, 1 - np.abs(x))]
     expected += [np.trunc(x), np.where(x > 0, x, y)]
     np.testing.assert_allclose(out[:-1].reshape(10, 16), expected, rtol=1e-6)
     assert out[-1] == 7
-    assert last == x[-1]
+    assert ends == (x[-1], x.min(), x.max())
     np.testing.assert_allclose(total, x.sum(dtype=np.float64), rtol=1e-5, atol=1e-5 * 16e6)
 
 

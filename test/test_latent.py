@@ -5,19 +5,21 @@ from depth_deblur_ros.core import latent
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.latent import (
+    LatentSteps,
+    noise_sigma,
+    restore_coarse_to_fine,
+    restored_light,
+)
+from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
+from depth_deblur_ros.core.quadratic import (
     _link_weights,
     _POWERS,
     _sum_rows,
     conjugate_gradients,
     EPSILON,
     EXPONENT,
-    LatentSteps,
-    noise_sigma,
-    restore_coarse_to_fine,
-    restored_light,
     reweighted,
 )
-from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
 from depth_deblur_ros.core.sweep import GUARD
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -59,7 +61,7 @@ def inside(planes):
 
 def restored(taken, blur, transfer, sigma, steps):
     """Give stored values."""
-    return stored_from_light(restored_light(taken, blur, transfer, sigma, steps), transfer)
+    return stored_from_light(restored_light(taken, blur.sweep, transfer, sigma, steps), transfer)
 
 
 def links_of(stored):

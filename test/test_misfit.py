@@ -10,8 +10,9 @@ from depth_deblur_ros.core.data import (
     Outcome,
     RgbdFrame,
 )
-from depth_deblur_ros.core.latent import EPSILON, EXPONENT, noise_sigma, SIGMA_FLOOR, SPACING
+from depth_deblur_ros.core.latent import noise_sigma, SIGMA_FLOOR, SPACING
 from depth_deblur_ros.core.light import light_from_stored, light_slope
+from depth_deblur_ros.core.quadratic import EPSILON, EXPONENT
 from depth_deblur_ros.core.solver import restore_known
 from depth_deblur_ros.misfit import energies_of
 import numpy as np

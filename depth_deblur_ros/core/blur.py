@@ -18,8 +18,10 @@ from functools import cached_property
 import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
-from depth_deblur_ros.core.seen import flow_parts, nearness_of, pack, seen_inverse_depth
-from depth_deblur_ros.core.sweep import Sweep, sweep_of, whole_blocks
+from depth_deblur_ros.core.instants import flow_at
+from depth_deblur_ros.core.lanes import greatest, larger, load, splat, whole_blocks, WIDTH
+from depth_deblur_ros.core.seen import flow_parts, nearness_of, pack, seen_by_pixel, seen_planes
+from depth_deblur_ros.core.sweep import Sweep, sweep_of
 from numba import get_num_threads, njit, prange
 import numpy as np
 import numpy.typing as npt
@@ -57,12 +59,16 @@ class BlurOperator:
     @cached_property
     def sweep(self) -> Sweep:
         """A laid out for blocks of pixels of colour planes."""
+        return self.thinned(0)
+
+    def thinned(self, spacing: float) -> Sweep:
+        """As `sweep`, with one instant for `spacing` px of a block's own blur; 0: all N."""
         height, width = self.inverse_depth.shape[:2]
         seen = np.moveaxis(self.inverse_depth, 2, 1)
         if width < whole_blocks(width):
             seen = np.pad(seen, [(0, 0), (0, 0), (0, whole_blocks(width) - width)], 'edge')
         flow = flow_parts(self.ray, self.motion, (height, width))
-        return sweep_of(np.ascontiguousarray(seen), flow, self.margin)
+        return sweep_of(np.ascontiguousarray(seen), flow, self.margin, spacing)
 
     def apply(self, latent: FloatImage) -> FloatImage:
         """Blur: A L, (5) of docs/method.md."""
@@ -128,13 +134,14 @@ def blur_operator(
     """
     ray, packed = pack(motion, camera)
     flow = flow_parts(ray, packed, depth.shape)
-    longest = math.sqrt(_largest(nearness_of(depth)[:, None], flow)[2])
+    near = np.pad(nearness_of(depth), [(0, 0), (0, flow.shape[2] - camera.width)], 'edge')
+    longest = math.sqrt(_largest(near[:, None], flow)[2])
     least = math.ceil(MIN_SAMPLES / spacing)
     samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), least, MAX_SAMPLES))
-    seen = seen_inverse_depth(motion, depth, camera, samples)
-    reach = max(_largest(np.moveaxis(seen, 2, 1), flow)[:2]) / 2
+    seen = seen_planes(motion, depth, camera, samples)
+    reach = max(_largest(seen, flow)[:2]) / 2
     margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: interpolation
-    return BlurOperator(ray, packed, seen, margin)
+    return BlurOperator(ray, packed, seen_by_pixel(seen, camera.width), margin)
 
 
 def _largest(nearness: FloatImage, flow: FloatImage) -> tuple[float, float, float]:
@@ -145,19 +152,20 @@ def _largest(nearness: FloatImage, flow: FloatImage) -> tuple[float, float, floa
     return x, y, square
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _largest_of_rows(nearness, flow, rows):  # type: ignore[no-untyped-def]
     height, samples, width = nearness.shape
+    near, parts = nearness.reshape(-1), flow.reshape(-1)
     for y in prange(height):
-        px = py = square = np.float32(0)
-        for i in range(samples):
-            for x in range(width):
-                w = nearness[y, i, x]
-                dx = flow[y, 0, x] + w * flow[y, 2, x]
-                dy = flow[y, 1, x] + w * flow[y, 3, x]
-                px, py = max(px, abs(dx)), max(py, abs(dy))
-                square = max(square, dx * dx + dy * dy)
-        rows[y, 0], rows[y, 1], rows[y, 2] = px, py, square
+        px = py = square = zero = splat(np.float32(0))
+        for k in range(width // WIDTH):
+            ax, ay, bx, by = flow_at(y, k, parts, width)
+            for i in range(samples):
+                w = load(near, (y * samples + i) * width + k * WIDTH)
+                dx, dy = ax + w * bx, ay + w * by
+                px, py = larger(px, larger(dx, zero - dx)), larger(py, larger(dy, zero - dy))
+                square = larger(square, dx * dx + dy * dy)
+        rows[y, 0], rows[y, 1], rows[y, 2] = greatest(px), greatest(py), greatest(square)
 
 
 @njit(cache=True, nogil=True, inline='always')

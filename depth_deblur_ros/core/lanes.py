@@ -27,6 +27,11 @@ _NOTHING = ir.Constant(_VECTOR, ir.Undefined)
 _instruction: Any = intrinsic
 
 
+def whole_blocks(size: int) -> int:
+    """Round a width up to whole blocks."""
+    return -(-size // WIDTH) * WIDTH
+
+
 class Lanes(types.Type):
     """The compiler's type of sixteen float32."""
 
@@ -104,6 +109,29 @@ def last_lane(typing: Any, lanes: Any) -> Any:
         return builder.extract_element(values[0], _INDEX(WIDTH - 1))
 
     return types.float32(LANES), build
+
+
+def _first_of_all(sign: str) -> Any:
+    """Make a function that gives the value that stands first by < or >."""
+
+    @_instruction  # type: ignore[untyped-decorator]
+    def reduce(typing: Any, lanes: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            best, half = values[0], WIDTH // 2
+            while half:
+                other = builder.shuffle_vector(
+                    best, _NOTHING, _order([(k + half) % WIDTH for k in range(WIDTH)])
+                )
+                best = builder.select(builder.fcmp_ordered(sign, best, other), best, other)
+                half //= 2
+            return builder.extract_element(best, _INDEX(0))
+
+        return types.float32(LANES), build
+
+    return reduce
+
+
+least, greatest = _first_of_all('<'), _first_of_all('>')
 
 
 @_instruction  # type: ignore[untyped-decorator]

@@ -8,7 +8,7 @@ kernels take rows of whole blocks (sweep.py), W' pixels for W.
 from __future__ import annotations
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
-from depth_deblur_ros.core.sweep import whole_blocks
+from depth_deblur_ros.core.lanes import whole_blocks
 from numba import njit, prange
 import numpy as np
 
@@ -20,11 +20,23 @@ def seen_inverse_depth(
     motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
 ) -> FloatImage:
     """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
+    return seen_by_pixel(seen_planes(motion, depth, camera, samples), depth.shape[1])
+
+
+def seen_by_pixel(planes: FloatImage, width: int) -> FloatImage:
+    """Look at planes (H, samples, W') as (H, W, samples)."""
+    return np.moveaxis(planes[..., :width], 1, 2)
+
+
+def seen_planes(
+    motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
+) -> FloatImage:
+    """Give w_i as `seen_inverse_depth`, (H, samples, whole blocks), beyond W as at its rim."""
     height, width = depth.shape
     seen = np.empty((height, samples, whole_blocks(width)), np.float32)
     ray, packed = pack(motion, camera)
     _see(nearness_of(depth), ray, packed, flow_parts(ray, packed, depth.shape), seen)
-    return np.moveaxis(seen[..., :width], 1, 2)
+    return seen
 
 
 def nearness_of(depth: FloatImage) -> FloatImage:

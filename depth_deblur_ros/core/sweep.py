@@ -8,24 +8,26 @@ are (3, H, W').
 At one instant the pixels of a block read places that lie side by side, too, but for a slow drift
 and for edges in depth. So a block reads the same few offsets for all its pixels: 2 x 2 of them
 where all displacements fall into one cell, with bilinear weights; some more where they straddle a
-cell's border, weighted by tents, which comes to the same; pixel by pixel beyond MANY.
+cell's border, weighted by tents, which comes to the same; pixel by pixel beyond MANY. In
+a thinned sweep blocks with a shorter blur have fewer instants (instants.py).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 from depth_deblur_ros.core.data import FloatImage
+from depth_deblur_ros.core.instants import back_at, cells_of, displacement, flow_at, thinned
 from depth_deblur_ros.core.lanes import (
-    larger,
     last_lane,
     load,
     next_lane,
-    smaller,
     splat,
     store,
     tent,
+    whole_blocks,
     WIDTH,
 )
 from numba import get_num_threads, njit, prange
@@ -42,6 +44,7 @@ class Sweep:
 
     nearness: FloatImage  # (H, N, W') inverse depth seen [1/m]
     flow: FloatImage  # (H, 4, W') a_x, a_y [px], b_x, b_y [px m] of the flow a + w b
+    shares: FloatImage  # (H, W' / 16) 1 / how many instants a block has: its first ones above
     cells: npt.NDArray[np.int16]  # (H, W' / 16, N, 4) least offset x, y; how many x, y
     far: np.float32  # px, the longest displacement along an axis
     room: int  # r
@@ -94,62 +97,20 @@ class Sweep:
             latent[:, first : first + rows] += strip[:, :rows]
         return latent
 
-    def _parts(self) -> tuple[FloatImage, FloatImage, npt.NDArray[np.int16], np.float32, int]:
-        return self.nearness, self.flow, self.cells, self.far, self.room
+    def _parts(self) -> tuple[Any, ...]:
+        return self.nearness, self.flow, self.shares, self.cells, self.far, self.room
 
 
-def whole_blocks(size: int) -> int:
-    """Round a width up to whole blocks."""
-    return -(-size // WIDTH) * WIDTH
+def sweep_of(nearness: FloatImage, flow: FloatImage, margin: int, spacing: float = 0.0) -> Sweep:
+    """
+    Lay out A for nearness (H, N, W') and flow (H, 4, W'); no pixel reads beyond the margin.
 
-
-def sweep_of(nearness: FloatImage, flow: FloatImage, margin: int) -> Sweep:
-    """Lay out A for nearness (H, N, W') and flow (H, 4, W'); no pixel reads beyond the margin."""
-    height, samples, width = nearness.shape
-    cells = np.empty((height, width // WIDTH, samples, 4), np.int16)
+    spacing: px of its own longest blur for which a block has an instant, of at most N; 0: all N.
+    """
     far = np.float32(margin - 1)
-    _find_cells(nearness, flow, far, cells)
-    return Sweep(nearness, flow, cells, far, margin + GUARD)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _back(i, samples):  # type: ignore[no-untyped-def]
-    """Give -t_i."""
-    return splat(np.float32(0.5) - np.float32(i + 0.5) / np.float32(samples))
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _displacement(a, b, w, back, far):  # type: ignore[no-untyped-def]
-    return larger(smaller(back * (a + w * b), splat(far)), splat(-far))
-
-
-@njit(cache=True, nogil=True)
-def _span(lanes):  # type: ignore[no-untyped-def]
-    """Give the first offset that a block's displacements need, and how many."""
-    low = high = lanes[0]
-    for j in range(1, WIDTH):
-        low, high = min(low, lanes[j]), max(high, lanes[j])
-    first = math.floor(low)
-    return first, math.floor(high) - first + 2
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _find_cells(nearness, flow, far, cells):  # type: ignore[no-untyped-def]
-    """Write where each block begins to read at each instant, and how many columns and rows."""
-    height, samples, width = nearness.shape
-    near, parts = nearness.reshape(-1), flow.reshape(-1)
-    for y in prange(height):
-        dx, dy = np.empty(WIDTH, np.float32), np.empty(WIDTH, np.float32)
-        for k in range(width // WIDTH):
-            at = 4 * y * width + k * WIDTH
-            for i in range(samples):
-                w, back = load(near, (y * samples + i) * width + k * WIDTH), _back(i, samples)
-                a, b = load(parts, at), load(parts, at + 2 * width)
-                store(dx, 0, _displacement(a, b, w, back, far))
-                a, b = load(parts, at + width), load(parts, at + 3 * width)
-                store(dy, 0, _displacement(a, b, w, back, far))
-                cells[y, k, i, 0], cells[y, k, i, 2] = _span(dx)
-                cells[y, k, i, 1], cells[y, k, i, 3] = _span(dy)
+    nearness, shares = thinned(nearness, flow, spacing)
+    cells = cells_of(nearness, flow, shares, far)
+    return Sweep(nearness, flow, shares, cells, far, margin + GUARD)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -182,22 +143,21 @@ def _read_each(plane, p, wide, places):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _aim(y, k, i, data, far, sizes):  # type: ignore[no-untyped-def]
+def _aim(place, i, back, parts, data, far):  # type: ignore[no-untyped-def]
     """
-    Say where block k of row y reads at instant i.
+    Say where a block reads at instant i; place: y, k, N, W'.
 
     Displacements u, v from the first offset; the offset's columns and rows from the block's own
     place; how many columns and rows of offsets there are.
     """
-    near, flow, cells = data
-    samples, width = sizes[1], sizes[2]
-    w, back = load(near, (y * samples + i) * width + k * WIDTH), _back(i, samples)
-    at = 4 * y * width + k * WIDTH
-    u = _displacement(load(flow, at), load(flow, at + 2 * width), w, back, far)
-    v = _displacement(load(flow, at + width), load(flow, at + 3 * width), w, back, far)
+    y, k, samples, width = place
+    ax, ay, bx, by = parts
+    near, _, _, cells = data
+    w, back = load(near, (y * samples + i) * width + k * WIDTH), splat(back)
     c = 4 * ((y * (width // WIDTH) + k) * samples + i)
     left, top = np.intp(cells[c]), np.intp(cells[c + 1])
-    u, v = u - splat(np.float32(left)), v - splat(np.float32(top))
+    u = displacement(ax, bx, w, back, far) - splat(np.float32(left))
+    v = displacement(ay, by, w, back, far) - splat(np.float32(top))
     return u, v, left, top, np.intp(cells[c + 2]), np.intp(cells[c + 3])
 
 
@@ -205,12 +165,16 @@ def _aim(y, k, i, data, far, sizes):  # type: ignore[no-untyped-def]
 def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ignore[no-untyped-def]
     """Write one row of `gather`; planes are flat, data the flat arrays of a Sweep."""
     height, samples, width, high, wide = sizes
-    plane, colour, share = high * wide, height * width, splat(np.float32(1 / samples))
+    plane, colour = high * wide, height * width
     places = np.empty(3 * WIDTH, np.float32)
     for k in range(width // WIDTH):
         r = g = b = splat(np.float32(0))
+        one, parts = data[2][y * (width // WIDTH) + k], flow_at(y, k, data[1], width)
         for i in range(samples):
-            u, v, left, top, columns, rows = _aim(y, k, i, data, far, sizes)
+            if (back := back_at(i, one)) < np.float32(-0.5):
+                break
+            place = y, k, samples, width
+            u, v, left, top, columns, rows = _aim(place, i, back, parts, data, far)
             p = (y + room + top) * wide + k * WIDTH + room + left
             if columns == 2 and rows == 2:
                 corners = _bilinear(u, v)
@@ -231,20 +195,20 @@ def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ig
                 r += _read_each(latent, p, wide, places)
                 g += _read_each(latent, p + plane, wide, places)
                 b += _read_each(latent, p + 2 * plane, wide, places)
-        at = y * width + k * WIDTH
+        at, share = y * width + k * WIDTH, splat(one)
         store(blurred, at, share * load(weight, at) * r)
         store(blurred, at + colour, share * load(weight, at + colour) * g)
         store(blurred, at + 2 * colour, share * load(weight, at + 2 * colour) * b)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _gather(latent, weight, blurred, nearness, flow, cells, far, room):  # type: ignore[no-untyped-def]
+def _gather(latent, weight, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
     height, samples, width = nearness.shape
     sizes = (height, samples, width, latent.shape[1], latent.shape[2])
-    data = (nearness.reshape(-1), flow.reshape(-1), cells.reshape(-1))
+    data = (nearness.reshape(-1), flow.reshape(-1), shares.reshape(-1), cells.reshape(-1))
     flat = (latent.reshape(-1), weight.reshape(-1), blurred.reshape(-1))
     for y in prange(height):
-        _gather_row(y, *flat, data, far, room, sizes)
+        _gather_row(np.intp(y), *flat, data, far, room, sizes)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -278,18 +242,27 @@ def _spread_each(plane, p, wide, places, value):  # type: ignore[no-untyped-def]
         plane[q + wide + 1] += v * u * b
 
 
+@njit(cache=True, nogil=True, inline='always')
+def _shared(blurred, at, colour, share):  # type: ignore[no-untyped-def]
+    """Give an instant's share of the three colours of a block."""
+    r, g, b = load(blurred, at), load(blurred, at + colour), load(blurred, at + 2 * colour)
+    return share * r, share * g, share * b
+
+
 @njit(cache=True, nogil=True)
 def _scatter_row(y, first, strip, blurred, data, far, room, sizes):  # type: ignore[no-untyped-def]
     """Spread one row over a strip that begins at row `first`; planes and strip are flat."""
     height, samples, width, high, wide = sizes
-    plane, colour, share = high * wide, height * width, splat(np.float32(1 / samples))
+    plane, colour = high * wide, height * width
     places = np.empty(3 * WIDTH, np.float32)
     for i in range(samples):
         for k in range(width // WIDTH):
-            at = y * width + k * WIDTH
-            r, g = share * load(blurred, at), share * load(blurred, at + colour)
-            b = share * load(blurred, at + 2 * colour)
-            u, v, left, top, columns, rows = _aim(y, k, i, data, far, sizes)
+            one = data[2][y * (width // WIDTH) + k]
+            if (back := back_at(i, one)) < np.float32(-0.5):
+                continue
+            r, g, b = _shared(blurred, y * width + k * WIDTH, colour, splat(one))
+            place, parts = (y, k, samples, width), flow_at(y, k, data[1], width)
+            u, v, left, top, columns, rows = _aim(place, i, back, parts, data, far)
             p = (y - first + room + top) * wide + k * WIDTH + room + left
             if columns == 2 and rows == 2:
                 corners = _bilinear(u, v)
@@ -313,10 +286,10 @@ def _scatter_row(y, first, strip, blurred, data, far, room, sizes):  # type: ign
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _scatter(blurred, strips, nearness, flow, cells, far, room):  # type: ignore[no-untyped-def]
+def _scatter(blurred, strips, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
     height, samples, width = nearness.shape
     sizes = (height, samples, width, strips.shape[2], strips.shape[3])
-    data = (nearness.reshape(-1), flow.reshape(-1), cells.reshape(-1))
+    data = (nearness.reshape(-1), flow.reshape(-1), shares.reshape(-1), cells.reshape(-1))
     flat, count = blurred.reshape(-1), strips.shape[0]
     for k in prange(count):
         strip = strips[k].reshape(-1)

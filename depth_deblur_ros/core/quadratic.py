@@ -1,0 +1,193 @@
+"""
+One reweighting of the image step: a quadratic problem, solved by conjugate gradients.
+
+Notation as in latent.py, (7) of docs/method.md. Each link between two neighbours pulls with a
+weight that the present image gives it, the steps are preconditioned with l'^2.
+[KF09] Krishnan & Fergus, NIPS 2009: the hyper-Laplacian prior. [IRLS] Levin et al., SIGGRAPH 2007.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from depth_deblur_ros.core.data import FloatImage
+from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
+from depth_deblur_ros.core.light import light_slope
+from depth_deblur_ros.core.sweep import GUARD, Sweep
+from numba import njit, prange
+import numpy as np
+
+EPSILON = 0.01  # stored units; differences below this count as noise
+EXPONENT = 0.8  # alpha of the prior [KF09]
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """
+    (7) with the weights of one reweighting: 1/2 |A L - B|^2_trust + 1/2 <L, links L>.
+
+    In planes, as sweep.py lays them out: blurred (3, H, W'), latent (3, h, w).
+    """
+
+    sweep: Sweep
+    trust: FloatImage  # (3, H, W')
+    links: FloatImage  # (4, h, w) weights to the neighbours right, below, below right, below left
+    ease: FloatImage  # (3, h, w) 1 / l'^2
+
+    def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
+        """Give minus the gradient at a latent image; missing = B - A latent."""
+        strips, r = self.sweep.strips(), np.zeros_like(latent)
+        self.sweep.scatter(self.trust * missing, strips)
+        self._sum(strips, -latent, r)
+        return r
+
+    def normal(self, d: FloatImage, strips: FloatImage, q: FloatImage) -> float:
+        """Write the normal equations' matrix times d into q; give <d, q>."""
+        self.sweep.scatter(self.sweep.gather(d, self.trust), strips)
+        return self._sum(strips, d, q)
+
+    def _sum(self, strips: FloatImage, x: FloatImage, out: FloatImage) -> float:
+        """Add strips of A' and the prior's part of x; give <x, out>."""
+        products = np.zeros(x.shape[1:2], np.float32)
+        rows = self.trust.shape[1]
+        _sum_rows(strips, rows, x, self.links, self.ease, out, products)
+        return float(products.sum(dtype=np.float64))
+
+
+def reweighted(
+    stored: FloatImage, sweep: Sweep, transfer: str, trust: FloatImage, weight: np.float32
+) -> Quadratic:
+    """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
+    links = np.zeros((4, *stored.shape[1:]), np.float32)
+    _link_weights(stored, weight, _POWERS, links)
+    ease = (1 / np.square(light_slope(stored, transfer))).astype(np.float32)
+    return Quadratic(sweep, trust, links, ease)
+
+
+def conjugate_gradients(
+    problem: Quadratic, latent: FloatImage, slope: FloatImage, limit: int
+) -> FloatImage:
+    """Solve from latent by `limit` steps, preconditioned with l'^2; slope = minus the gradient."""
+    latent, r = latent.copy(), slope.copy()
+    d, q, strips = np.zeros_like(r), np.zeros_like(r), problem.sweep.strips()
+    products = np.zeros(r.shape[1], np.float32)
+    _advance(latent, r, d, q, problem.ease, np.float32(0), products)
+    rz, last = float(products.sum(dtype=np.float64)), math.inf
+    for _ in range(limit):
+        if rz <= 0:
+            break
+        _turn(d, r, problem.ease, np.float32(rz / last))
+        step = np.float32(rz / problem.normal(d, strips, q))
+        _advance(latent, r, d, q, problem.ease, step, products)
+        rz, last = float(products.sum(dtype=np.float64)), rz
+    return latent
+
+
+# x^(EXPONENT / 2 - 1) from 2^-14 to 2, in even steps within each octave, counted by a float's bits
+POWER_BITS = 6  # 2^6 steps in each octave
+_POWER_FROM, _POWER_SHIFT = (127 - 14) << 23, 23 - POWER_BITS
+_POWERS = (
+    (_POWER_FROM + (np.arange((15 << POWER_BITS) + 2) << _POWER_SHIFT).astype(np.int32))
+    .view(np.float32)
+    .astype(np.float64)
+    ** (EXPONENT / 2 - 1)
+).astype(np.float32)
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _link_weights(stored, weight, powers, links):  # type: ignore[no-untyped-def]
+    """Weigh the links to the neighbours right, below, below right, below left: [IRLS]."""
+    _, height, width = stored.shape
+    rest_of, mask = np.float32(2.0**-_POWER_SHIFT), np.uint32((1 << _POWER_SHIFT) - 1)
+    third, floor = np.float32(1 / 3), np.float32(EPSILON * EPSILON)
+    for y in prange(GUARD, height - GUARD):
+        mean = np.empty(width, np.float32)
+        bits = mean.view(np.int32)
+        for k in range(4):
+            down, aside = min(k, 1), (1, 0, 1, -1)[k]
+            first, end = max(-aside, 0), width - max(aside, 0)
+            if down and y == height - GUARD - 1:
+                continue
+            mean[:] = 1
+            for x in range(first, end):
+                s = np.float32(0)
+                for c in range(3):
+                    d = stored[c, y + down, x + aside] - stored[c, y, x]
+                    s += d * d
+                mean[x] = third * s + floor
+            # Diagonal links are longer: half the weight.
+            share = weight if k < 2 else weight / 2
+            for x in range(first, end):
+                place = np.uint32(bits[x] - _POWER_FROM)
+                i, rest = place >> np.uint32(_POWER_SHIFT), rest_of * np.float32(place & mask)
+                links[k, y, x] = share * (powers[i] + rest * (powers[i + 1] - powers[i]))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _pull(u, links, ease, p, n, link):  # type: ignore[no-untyped-def]
+    """Give how one link draws the values at p away from their neighbours at n."""
+    return load(links, link) * (load(u, p) - load(u, n)) * smaller(load(ease, p), load(ease, n))
+
+
+@njit(cache=True, nogil=True)
+def _add_prior(y, x, links, ease, out, products, room):  # type: ignore[no-untyped-def]
+    """Add the prior's quadratic form of x to one row of out; all flat but out (3, h, w)."""
+    _, high, wide = out.shape
+    flat, plane = out.reshape(-1), high * wide
+    product = splat(np.float32(0))
+    for k in range(wide // WIDTH):
+        here = y * wide + k * WIDTH
+        for c in range(3):
+            p = c * plane + here
+            s = load(flat, p)
+            for m in range(4):
+                ahead = (1, wide, wide + 1, wide - 1)[m]
+                s += _pull(x, links, ease, p, p + ahead, m * plane + here)
+                s += _pull(x, links, ease, p, p - ahead, m * plane + here - ahead)
+            store(flat, p, s)
+            product += load(x, p) * s
+    products[y] = total(product, room)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sum_rows(strips, rows, x, links, ease, out, products):  # type: ignore[no-untyped-def]
+    """Write the sum of strips of A' (of `rows` rows of B) and the prior's part of x into out."""
+    high = out.shape[1]
+    count, _, depth, _ = strips.shape
+    wide = out.shape[2]
+    flat = (x.reshape(-1), links.reshape(-1), ease.reshape(-1))
+    for y in prange(GUARD, high - GUARD):
+        for c in range(3):
+            for i in range(wide):
+                out[c, y, i] = 0
+            for k in range(count):
+                j = y - np.int64(k) * rows // count
+                if 0 <= j < depth:
+                    for i in range(wide):
+                        out[c, y, i] += strips[k, c, j, i]
+        _add_prior(y, *flat, out, products, np.empty(WIDTH, np.float32))
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _advance(latent, r, d, q, ease, step, products):  # type: ignore[no-untyped-def]
+    """Go along d: latent + step d, r - step q; give <r, r / ease> of each row."""
+    _, height, width = r.shape
+    for y in prange(height):
+        s = np.float32(0)
+        for c in range(3):
+            for x in range(width):
+                latent[c, y, x] += step * d[c, y, x]
+                r[c, y, x] -= step * q[c, y, x]
+                s += r[c, y, x] * r[c, y, x] / ease[c, y, x]
+        products[y] = s
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=True)
+def _turn(d, r, ease, share):  # type: ignore[no-untyped-def]
+    """Turn d to r / ease + share d."""
+    _, height, width = r.shape
+    for y in prange(height):
+        for c in range(3):
+            for x in range(width):
+                d[c, y, x] = r[c, y, x] / ease[c, y, x] + share * d[c, y, x]
