@@ -54,10 +54,9 @@ def pack(motion: Motion, camera: CameraIntrinsics) -> tuple[FloatImage, FloatIma
 
 
 def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> FloatImage:
-    """Give a_x, a_y [px], b_x, b_y [px m] of the flow a + w b, (3), as (H, 4, whole blocks)."""
+    """Give a_x, a_y [px], b_x, b_y [px m] of the flow a + w b, (3): (H, 4, W'), its rim beyond."""
     height, width = shape
-    beyond = ray[width - 1] + (ray[1] - ray[0]) * np.arange(1, whole_blocks(width) - width + 1)
-    xn = np.concatenate([ray[:width], beyond])[None].astype(np.float32)
+    xn = np.pad(ray[:width], (0, whole_blocks(width) - width), 'edge')[None]
     yn = ray[width:, None]
     tx, ty, tz = motion[:3, None, None] + motion[8:, None, None] * yn
     vx, vy, vz, fx, fy = motion[3:8]

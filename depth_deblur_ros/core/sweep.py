@@ -143,7 +143,7 @@ def _read_each(plane, p, wide, places):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _aim(place, i, back, parts, data, far):  # type: ignore[no-untyped-def]
+def _aim(place, i, share, parts, data, far):  # type: ignore[no-untyped-def]
     """
     Say where a block reads at instant i; place: y, k, N, W'.
 
@@ -153,7 +153,7 @@ def _aim(place, i, back, parts, data, far):  # type: ignore[no-untyped-def]
     y, k, samples, width = place
     ax, ay, bx, by = parts
     near, _, _, cells = data
-    w, back = load(near, (y * samples + i) * width + k * WIDTH), splat(back)
+    w, back = load(near, (y * samples + i) * width + k * WIDTH), splat(back_at(i, share))
     c = 4 * ((y * (width // WIDTH) + k) * samples + i)
     left, top = np.intp(cells[c]), np.intp(cells[c + 1])
     u = displacement(ax, bx, w, back, far) - splat(np.float32(left))
@@ -171,10 +171,10 @@ def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ig
         r = g = b = splat(np.float32(0))
         one, parts = data[2][y * (width // WIDTH) + k], flow_at(y, k, data[1], width)
         for i in range(samples):
-            if (back := back_at(i, one)) < np.float32(-0.5):
+            if back_at(i, one) < np.float32(-0.5):
                 break
             place = y, k, samples, width
-            u, v, left, top, columns, rows = _aim(place, i, back, parts, data, far)
+            u, v, left, top, columns, rows = _aim(place, i, one, parts, data, far)
             p = (y + room + top) * wide + k * WIDTH + room + left
             if columns == 2 and rows == 2:
                 corners = _bilinear(u, v)
@@ -258,11 +258,11 @@ def _scatter_row(y, first, strip, blurred, data, far, room, sizes):  # type: ign
     for i in range(samples):
         for k in range(width // WIDTH):
             one = data[2][y * (width // WIDTH) + k]
-            if (back := back_at(i, one)) < np.float32(-0.5):
+            if back_at(i, one) < np.float32(-0.5):
                 continue
             r, g, b = _shared(blurred, y * width + k * WIDTH, colour, splat(one))
             place, parts = (y, k, samples, width), flow_at(y, k, data[1], width)
-            u, v, left, top, columns, rows = _aim(place, i, back, parts, data, far)
+            u, v, left, top, columns, rows = _aim(place, i, one, parts, data, far)
             p = (y - first + room + top) * wide + k * WIDTH + room + left
             if columns == 2 and rows == 2:
                 corners = _bilinear(u, v)
