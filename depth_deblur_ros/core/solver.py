@@ -82,11 +82,11 @@ def _budget(mode: str, *, known: bool) -> int:
 def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, budget: int) -> Motion:
     """Refine the motion, if there is a budget, and tell a covariance as large as errors are."""
     if not budget:
-        return calibrated(found.motion, found.axes, OF_SPECTRA)
+        return calibrated(found.motion, found.axes, OF_SPECTRA * found.doubt)
     light = light_from_stored(frame.image, frame.camera.transfer)
     light = _grey(light, _shares(frame.image))
     motion = refine(light, depth, frame.camera, found, budget)
-    return calibrated(motion, found.axes, OF_LIKELIHOOD)
+    return calibrated(motion, found.axes, OF_LIKELIHOOD * found.doubt)
 
 
 def restore_known(

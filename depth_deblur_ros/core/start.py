@@ -40,11 +40,11 @@ SHORT_TRUST = 0.11  # least -S at full scale of a short blur
 CLOSE_BELOW = 9.0  # px; shorter blurs are looked at close up
 CLOSE_TRUST = 0.25  # least common -S at full scale and close up
 CLOSE_SHARE = 0.12  # least -S close up by itself
-PLAIN = 5.0  # px; longer blurs show at full scale as well
+PLAIN, PLAIN_TRUST = 5.0, 0.14  # px; longer blurs show as much at full scale as well
 CLOSE_BIAS = 1.0  # px; close up, blurs seem longer: the root of both squares
 LONG_TRUST = 0.2  # least common -S of a long blur
 # Where the full scale is the only one; shorter blurs leave deeper bands than long ones.
-ALONE_TRUST, ALONE_SHORT, ALONE_SHORT_TRUST = 0.14, 16.0, 0.175
+ALONE_TRUST, ALONE_SHORT, ALONE_SHORT_TRUST = 0.15, 16.0, 0.175
 DOUBT = 1.3  # times that where the picture looks sharp
 CLEARLY_SHARP, RATHER_SHARP = (
     1.15,
@@ -58,7 +58,7 @@ EDGED_COARSE = 1.06  # like these at half the size, where noise makes none: DOUB
 SMEARED, SMEAR = 1.005, 8.0  # edges that no blur below so many px leaves
 BELIEF = 0.4  # common -S at which a motion is taken for certain
 # Where the full scale is the only one, what has less quality is wrong one time in four: variance.
-LONELY, LONELY_SPREAD = 0.45, 25.0
+LONELY, LONELY_DOUBT = 0.45, 25.0
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
 
@@ -68,7 +68,8 @@ class Start:
     """
     The first motion (zero unless solved), what it is worth, and axes G.
 
-    spread (9, 9): covariance of the motion by rows.
+    spread (9, 9): covariance of the motion by rows, if it is the right one; doubt: how many times
+    larger, as it may be another.
     """
 
     motion: Motion
@@ -76,6 +77,7 @@ class Start:
     quality: float
     axes: Vector = field(default_factory=lambda: np.eye(9))
     spread: Vector = field(default_factory=lambda: np.zeros((9, 9)))
+    doubt: float = 1.0
 
 
 def blind_start(
@@ -116,12 +118,11 @@ def blind_start(
         return _nothing(Outcome.SHARP if edges.along > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     covariance = _covariance(q, scales, axes)
-    if len(scales) == 1 and quality < LONELY:
-        covariance = LONELY_SPREAD * covariance
+    doubt = LONELY_DOUBT if len(scales) == 1 and quality < LONELY else 1.0
     if scales[-1].factor == CLOSE:
         q = q * math.sqrt(1 - (CLOSE_BIAS / length(q)) ** 2)
     motion = Motion.from_vector(axes @ q, covariance[:6, :6])
-    return Start(motion, Outcome.SOLVED, quality, axes, covariance)
+    return Start(motion, Outcome.SOLVED, quality, axes, covariance, doubt)
 
 
 def _found(
@@ -156,7 +157,7 @@ def _trusted(q: Vector, length: float, scales: list[Scale], edges: Edges) -> boo
 def _short_trusted(q: Vector, length: float, both: list[Scale]) -> bool:
     """Tell whether a blur of this length [px] is seen at full scale and close up together."""
     whole, close = (float(scores(q[None], scale.evidence)[0]) for scale in both)
-    seen = close < -CLOSE_SHARE and (length < PLAIN or whole < -ALONE_TRUST)
+    seen = close < -CLOSE_SHARE and (length < PLAIN or whole < -PLAIN_TRUST)
     enough = bool(common_score(q[None], both)[0] < -CLOSE_TRUST)
     return SHORTEST <= length < CLOSE_BELOW and seen and enough
 
