@@ -7,7 +7,6 @@ how unlike a sharp image it is. Told at the two levels of the image step, for pa
 
 from __future__ import annotations
 
-import cv2
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
 from depth_deblur_ros.core.data import (
     DeblurResult,
@@ -17,8 +16,9 @@ from depth_deblur_ros.core.data import (
     Outcome,
     RgbdFrame,
 )
-from depth_deblur_ros.core.latent import noise_sigma, SATURATED, SIGMA_FLOOR, SPACING
-from depth_deblur_ros.core.light import light_from_stored, light_slope
+from depth_deblur_ros.core.latent import picture_sigma, SATURATED, SIGMA_FLOOR, SPACING
+from depth_deblur_ros.core.light import as_colour, light_from_stored, light_slope
+from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.quadratic import EPSILON, EXPONENT
 import numpy as np
 
@@ -36,23 +36,25 @@ def energies_of(frame: RgbdFrame, result: DeblurResult, prior: float) -> tuple[E
     change = np.abs(result.image - frame.image).max()  # of what a bag has rounded, too
     if result.outcome is not Outcome.SOLVED or change * GREY_LEVELS < 1:
         return ()
-    taken, sharp = (_colour(image) for image in (frame.image, result.image))
-    sigma, steps = noise_sigma(taken), []
-    for level, parts in enumerate((2, 1)):
+    taken, sharp = (
+        Level(as_colour(image), result.depth, frame.camera)
+        for image in (frame.image, result.image)
+    )
+    sigma, steps = picture_sigma(taken.image), []
+    for size, parts in enumerate((2, 1)):
         width, height = frame.camera.width // parts, frame.camera.height // parts
         if min(width, height) < MIN_SIDE:
             continue
-        camera = frame.camera.scaled(width, height)
-        depth = _resized(result.depth, width, height, cv2.INTER_NEAREST)
-        blur = blur_operator(result.motion, depth, camera, SPACING)
-        first, last = (_resized(image, width, height, cv2.INTER_AREA) for image in (taken, sharp))
-        weight = prior * max(sigma / parts, SIGMA_FLOOR[camera.transfer]) ** 2
-        for step, image in (('before', first), ('after', last)):
+        first, last = (scaled_level(level, width, height) for level in (taken, sharp))
+        blur = blur_operator(result.motion, first.depth, first.camera, SPACING)
+        transfer = frame.camera.transfer
+        weight = prior * max(sigma / parts, SIGMA_FLOOR[transfer]) ** 2
+        for step, level in (('before', first), ('after', last)):
             terms = {
-                'misfit': _misfit(image, first, blur, camera.transfer),
-                'prior': weight * _roughness(image),
+                'misfit': _misfit(level.image, first.image, blur, transfer),
+                'prior': weight * _roughness(level.image),
             }
-            steps.append(EnergyStep(level, step, terms))
+            steps.append(EnergyStep(size, step, terms))
     return tuple(steps)
 
 
@@ -77,13 +79,3 @@ def _roughness(stored: FloatImage) -> float:
         power = np.square(there - here).mean(axis=2, dtype=np.float64) + EPSILON**2
         total += weight / EXPONENT * float(np.power(power, EXPONENT / 2).sum())
     return GREY_LEVELS**2 * total / float(stored.shape[0] * stored.shape[1])
-
-
-def _colour(image: FloatImage) -> FloatImage:
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
-
-
-def _resized(image: FloatImage, width: int, height: int, how: int) -> FloatImage:
-    if image.shape[:2] == (height, width):
-        return image
-    return np.asarray(cv2.resize(image, (width, height), interpolation=how), np.float32)

@@ -10,6 +10,7 @@ from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.joint import refine
+from depth_deblur_ros.core.pyramid import Level
 from depth_deblur_ros.core.start import motion_axes, Start
 import numpy as np
 from pictures import texture
@@ -70,7 +71,7 @@ def test_an_image_that_tells_something_narrows_the_covariance():
 def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
     monkeypatch.setattr(joint, 'READABLE', 5.0)
     monkeypatch.setattr(joint, 'LEAST_SIDE', 40)
-    parts = joint._parts(blurred(TRUTH), DEPTH, CAMERA, 9.0, BUDGET)
+    parts = joint._parts(Level(blurred(TRUTH), DEPTH, CAMERA), 9.0, BUDGET)
     assert {part.light.shape for part in parts} == {(40, 56)}
     fx = {part.camera.fx for part in parts}
     assert fx == {CAMERA.fx / 2}
@@ -79,7 +80,7 @@ def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
 def test_parts_lie_where_the_picture_is_busy():
     light = np.full(DEPTH.shape, 0.5, np.float32)
     light[10:40, 60:100] += texture(0, (30, 40)) - 0.5
-    part = joint._parts(light, DEPTH, CAMERA, 5.0, 160 * 224 // 4)[0]
+    part = joint._parts(Level(light, DEPTH, CAMERA), 5.0, 160 * 224 // 4)[0]
     assert part.light.std() > 0
     assert np.ptp(part.light) == pytest.approx(np.ptp(light), rel=1e-6)
 
@@ -87,7 +88,7 @@ def test_parts_lie_where_the_picture_is_busy():
 def test_the_camera_of_a_part_sees_what_the_frame_sees():
     """A ray through a part's pixel is the ray through the same pixel of the frame."""
     light = blurred(TRUTH)
-    for part in joint._parts(light, DEPTH, CAMERA, 5.0, 160 * 224 // 4):
+    for part in joint._parts(Level(light, DEPTH, CAMERA), 5.0, 160 * 224 // 4):
         left, top = CAMERA.cx - part.camera.cx, CAMERA.cy - part.camera.cy
         assert left == round(left) and top == round(top)
         rows, columns = part.light.shape

@@ -15,7 +15,7 @@ import numpy as np
 BLOCK = 8  # px
 CLEAR = 1.6  # times the others, along both axes; without JPEG at most 1.36
 SPARSE = 4  # every so many-th pixel along a border
-LEAST_SIDE = 8 * BLOCK  # px; smaller pictures show no grid
+LEAST_SIDE = 16 * BLOCK  # px; in smaller pictures chance looks like a grid
 
 
 def block_sigma(stored: FloatImage) -> float:

@@ -18,11 +18,11 @@ from functools import partial
 import math
 from typing import TypeVar
 
-import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vector
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.start import Start
 from numba import (  # type: ignore[attr-defined]
     get_num_threads,
@@ -64,7 +64,7 @@ def refine(
         return blur_length(p, depth, camera)
 
     p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
-    parts = _parts(light, depth, camera, length(p), budget)
+    parts = _parts(Level(light, depth, camera), length(p), budget)
     begun = _each(lambda part: _begun(part, p), parts)
     return _moved(begun, p, certainty, length)
 
@@ -138,18 +138,14 @@ def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
     return np.asarray(half * np.clip(values, *BENDS) @ half.T)
 
 
-def _parts(
-    light: FloatImage, depth: FloatImage, camera: CameraIntrinsics, length: float, budget: int
-) -> list[Part]:
+def _parts(level: Level, length: float, budget: int) -> list[Part]:
     """Choose one part of each quarter, the most textured, at a size where the blur is READABLE."""
-    factor = 1
-    while length > READABLE * factor and min(light.shape) >= 4 * LEAST_SIDE * factor:
+    factor, least = 1, min(level.image.shape)
+    while length > READABLE * factor and least >= 4 * LEAST_SIDE * factor:
         factor *= 2
     if factor > 1:
-        size = (camera.width // factor, camera.height // factor)
-        light = np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA), np.float32)
-        depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
-        camera = camera.scaled(*size)
+        level = scaled_level(level, level.camera.width // factor, level.camera.height // factor)
+    light, depth, camera = level.image, level.depth, level.camera
     height, width = (side // 2 for side in light.shape)
     pixels = budget * min(1.0, AFFORDABLE * factor / length)
     share = min(1.0, math.sqrt(pixels / light.size))

@@ -23,6 +23,7 @@ from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.compression import block_sigma
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, MIN_SIDE, Motion
 from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
+from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.quadratic import conjugate_gradients, reweighted
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
@@ -75,6 +76,11 @@ def noise_sigma(stored: FloatImage) -> float:
     return float(np.sqrt(np.percentile(power, 20) / 36))
 
 
+def picture_sigma(stored: FloatImage) -> float:
+    """Estimate noise and what JPEG took [stored units], of a blurred image (H, W, 3)."""
+    return math.hypot(noise_sigma(stored), block_sigma(stored))
+
+
 def restore_coarse_to_fine(
     blurred: FloatImage,
     depth: FloatImage,
@@ -88,36 +94,28 @@ def restore_coarse_to_fine(
     At half the size an eighth of the work brings most of what is long and slow to converge, and
     so on. Noise makes the prior weigh more, which takes fewer steps, and fewer instants do.
     """
-    sigma = math.hypot(noise_sigma(blurred), block_sigma(blurred))
+    sigma = picture_sigma(blurred)
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
     steps = replace(steps, inner=math.ceil(worth * steps.inner))
     wider = 1 - worth
     spacing = (SPACING + WIDER * wider, OWN_SPACING + OWN_WIDER * wider)
-    light = _restored(blurred, depth, motion, camera, Effort(sigma, steps, spacing))
+    light = _restored(Level(blurred, depth, camera), motion, Effort(sigma, steps, spacing))
     return stored_from_light(light, camera.transfer)
 
 
-def _restored(
-    blurred: FloatImage,
-    depth: FloatImage,
-    motion: Motion,
-    camera: CameraIntrinsics,
-    effort: Effort,
-) -> FloatImage:
+def _restored(level: Level, motion: Motion, effort: Effort) -> FloatImage:
     """Restore light from that of half the size, as long as there is one."""
-    first, steps = None, effort.steps
+    first, steps, camera = None, effort.steps, level.camera
     width, height = camera.width // 2, camera.height // 2
     if min(width, height) >= MIN_SIDE:
-        small = _resized(blurred, width, height, cv2.INTER_AREA)
-        near = _resized(depth, width, height, cv2.INTER_NEAREST)
         coarse = LatentSteps(steps.prior, COARSE_OUTER, round(COARSE_LONGER * steps.inner))
         # Four pixels in one: half the noise.
         less = replace(effort, sigma=effort.sigma / 2, steps=coarse)
-        half = _restored(small, near, motion, camera.scaled(width, height), less)
+        half = _restored(scaled_level(level, width, height), motion, less)
         first = _magnified(half, camera)
     longest, own = effort.spacing
-    sweep = blur_operator(motion, depth, camera, longest).thinned(own)
-    return restored_light(blurred, sweep, camera.transfer, effort.sigma, steps, first=first)
+    sweep = blur_operator(motion, level.depth, camera, longest).thinned(own)
+    return restored_light(level.image, sweep, camera.transfer, effort.sigma, steps, first=first)
 
 
 def _magnified(light: FloatImage, camera: CameraIntrinsics) -> FloatImage:

@@ -49,6 +49,11 @@ def stored_from_light(light: FloatImage, transfer: str) -> FloatImage:
     return _mapped(light, _look_up_octaves, _STORED)
 
 
+def as_colour(image: FloatImage) -> FloatImage:
+    """Give an image (H, W, 3); a grey one (H, W) thrice."""
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
+
+
 def light_slope(stored: FloatImage, transfer: str) -> FloatImage:
     """Give l'(v), no less than SLOPE_FLOOR: noise of light is noise of v times this."""
     if transfer == 'linear':

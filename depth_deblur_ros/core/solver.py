@@ -32,7 +32,7 @@ from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.joint import refine
 from depth_deblur_ros.core.latent import LatentSteps, restore_coarse_to_fine
 from depth_deblur_ros.core.lens import undistorted
-from depth_deblur_ros.core.light import light_from_stored, stored_from_light
+from depth_deblur_ros.core.light import as_colour, light_from_stored, stored_from_light
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
 from depth_deblur_ros.core.trust import calibrated, OF_LIKELIHOOD, OF_SPECTRA
@@ -121,7 +121,7 @@ def _restored(
     frame: RgbdFrame, depth: FloatImage, motion: Motion, params: SolverParams
 ) -> FloatImage:
     """Run the image step on a colour or grey frame."""
-    colour, camera = _colour(frame.image), frame.camera
+    colour, camera = as_colour(frame.image), frame.camera
     if params.method == 'paper':
         from depth_deblur_ros.core.alternation import restore
 
@@ -143,13 +143,9 @@ def _alternated(
     """Find the motion by the paper's method, with the energies on the way."""
     from depth_deblur_ros.core.alternation import alternate  # brings scipy: half a second
 
-    light = light_from_stored(_colour(frame.image), frame.camera.transfer)
+    light = light_from_stored(as_colour(frame.image), frame.camera.transfer)
     found = alternate(light, depth, frame.camera, params)
     return Start(Motion.from_vector(found.p), found.outcome, found.quality), found.trace
-
-
-def _colour(image: FloatImage) -> FloatImage:
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
 
 
 def _grey(image: FloatImage, shares: FloatImage) -> FloatImage:
