@@ -219,6 +219,14 @@ def test_a_thinned_operator_is_its_slow_twin(seed, spacing, count):
     np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
 
 
+def test_an_operator_forgets_what_it_was_used_for():
+    """Its room for results is used again and again."""
+    rng, blur = np.random.default_rng(0), shift(9 / 32, 7 / 32)
+    images = rng.random((2, 48, 64, 3), np.float32)
+    apart = [shift(9 / 32, 7 / 32).adjoint(image) for image in images]
+    np.testing.assert_array_equal([blur.adjoint(image) for image in images], apart)
+
+
 def test_a_block_has_as_many_instants_as_its_own_blur_is_long():
     depth = np.full((48, 64), 20, np.float32)
     depth[:, 40:56] = 1.0

@@ -1,6 +1,7 @@
 """Stored values and light: exact cases, there and back, slope."""
 
 from depth_deblur_ros.core.light import (
+    light_ease,
     light_from_stored,
     light_slope,
     SLOPE_FLOOR,
@@ -72,3 +73,9 @@ def test_the_slope_is_the_derivative_down_to_its_floor():
     np.testing.assert_allclose(found, np.maximum(slope, SLOPE_FLOOR), rtol=1e-5)
     assert found[0] == np.float32(SLOPE_FLOOR)
     np.testing.assert_array_equal(light_slope(FINE, 'linear'), 1)
+
+
+@transfers
+def test_ease_is_one_over_the_squared_slope(transfer):
+    slope = light_slope(FINE, transfer)
+    np.testing.assert_allclose(light_ease(FINE, transfer), 1 / slope**2, rtol=1e-3)

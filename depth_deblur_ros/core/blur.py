@@ -45,6 +45,7 @@ class BlurOperator:
     motion: npt.NDArray[np.float32]  # (11,): theta, v, fx, fy, rolling
     inverse_depth: FloatImage  # (H, W, N) seen at each instant [1/m]
     margin: int
+    parts: FloatImage | None = None  # flow_parts, if known
 
     @property
     def _shape(self) -> tuple[int, int, int]:
@@ -67,7 +68,9 @@ class BlurOperator:
         seen = np.moveaxis(self.inverse_depth, 2, 1)
         if width < whole_blocks(width):
             seen = np.pad(seen, [(0, 0), (0, 0), (0, whole_blocks(width) - width)], 'edge')
-        flow = flow_parts(self.ray, self.motion, (height, width))
+        flow = self.parts
+        if flow is None:
+            flow = flow_parts(self.ray, self.motion, (height, width))
         return sweep_of(np.ascontiguousarray(seen), flow, self.margin, spacing)
 
     def apply(self, latent: FloatImage) -> FloatImage:
@@ -138,10 +141,10 @@ def blur_operator(
     longest = math.sqrt(_largest(near[:, None], flow)[2])
     least = math.ceil(MIN_SAMPLES / spacing)
     samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), least, MAX_SAMPLES))
-    seen = seen_planes(motion, depth, camera, samples)
+    seen = seen_planes(depth, ray, packed, flow, samples)
     reach = max(_largest(seen, flow)[:2]) / 2
     margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: interpolation
-    return BlurOperator(ray, packed, seen_by_pixel(seen, camera.width), margin)
+    return BlurOperator(ray, packed, seen_by_pixel(seen, camera.width), margin, flow)
 
 
 def _largest(nearness: FloatImage, flow: FloatImage) -> tuple[float, float, float]:

@@ -22,7 +22,7 @@ import cv2
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.compression import block_sigma
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, MIN_SIDE, Motion
-from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
+from depth_deblur_ros.core.light import light_ease, light_from_stored, stored_from_light
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.quadratic import conjugate_gradients, reweighted
 from depth_deblur_ros.core.sweep import Sweep
@@ -148,16 +148,17 @@ def restored_light(
     height, width = blurred.shape[:2]
     stored = sweep.blurred_planes(blurred)
     light = light_from_stored(stored, transfer)
-    full, noise = stored >= SATURATED, 1 / np.square(light_slope(stored, transfer))
+    full, noise = stored >= SATURATED, light_ease(stored, transfer)
     noise[:, :, width:] = 0
+    within, saturated = np.ones_like(light), bool(full.any())
     start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
-    within = sweep.blurred_planes(np.ones_like(blurred))
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for _ in range(steps.outer):
-        missing = light - sweep.gather(latent, within)
+        missing = sweep.gather(latent, within, sweep.taken)
+        np.subtract(light, missing, out=missing)
         # What is saturated says only "at least this": drop it where the model gives more.
-        trust = np.where(full & (missing <= 0), np.float32(0), noise)
+        trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
         problem = reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
         latent = conjugate_gradients(problem, latent, problem.slope(missing, latent), steps.inner)
     r = sweep.room

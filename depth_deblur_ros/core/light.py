@@ -31,6 +31,7 @@ def _light(v: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 _KNEES = np.arange(STEPS + 2) / STEPS
 _LIGHT = _light(_KNEES).astype(np.float32)
 _SLOPE = (2.4 / 1.055 * ((_KNEES + 0.055) / 1.055) ** 1.4).astype(np.float32)
+_EASE = (1 / np.maximum(_SLOPE, np.float32(SLOPE_FLOOR)) ** 2).astype(np.float32)
 _OCTAVES = (
     (np.arange((9 << OCTAVE_BITS) + 2) << (23 - OCTAVE_BITS)).astype(np.int32) + LEAST_BITS
 ).view(np.float32)
@@ -58,7 +59,15 @@ def light_slope(stored: FloatImage, transfer: str) -> FloatImage:
     """Give l'(v), no less than SLOPE_FLOOR: noise of light is noise of v times this."""
     if transfer == 'linear':
         return np.ones_like(stored)
-    return np.maximum(_mapped(stored, _look_up, _SLOPE), np.float32(SLOPE_FLOOR))
+    slope = _mapped(stored, _look_up, _SLOPE)
+    return np.maximum(slope, np.float32(SLOPE_FLOOR), out=slope)
+
+
+def light_ease(stored: FloatImage, transfer: str) -> FloatImage:
+    """Give 1 / l'(v)^2, l' as `light_slope`."""
+    if transfer == 'linear':
+        return np.ones_like(stored)
+    return _mapped(stored, _look_up, _EASE)
 
 
 def _mapped(values: FloatImage, look_up, table: FloatImage) -> FloatImage:  # type: ignore[no-untyped-def]

@@ -13,7 +13,7 @@ import math
 
 from depth_deblur_ros.core.data import FloatImage
 from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
-from depth_deblur_ros.core.light import light_slope
+from depth_deblur_ros.core.light import light_ease
 from depth_deblur_ros.core.sweep import GUARD, Sweep
 from numba import njit, prange
 import numpy as np
@@ -37,15 +37,15 @@ class Quadratic:
 
     def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
         """Give minus the gradient at a latent image; missing = B - A latent."""
-        strips, r = self.sweep.strips(), np.zeros_like(latent)
-        self.sweep.scatter(self.trust * missing, strips)
-        self._sum(strips, -latent, r)
+        strips = self.sweep.scatter(np.multiply(self.trust, missing, out=self.sweep.taken))
+        x, r = np.negative(latent, out=self.sweep.directions[0]), np.zeros_like(latent)
+        self._sum(strips, x, r)
         return r
 
-    def normal(self, d: FloatImage, strips: FloatImage, q: FloatImage) -> float:
+    def normal(self, d: FloatImage, q: FloatImage) -> float:
         """Write the normal equations' matrix times d into q; give <d, q>."""
-        self.sweep.scatter(self.sweep.gather(d, self.trust), strips)
-        return self._sum(strips, d, q)
+        blurred = self.sweep.gather(d, self.trust, self.sweep.taken)
+        return self._sum(self.sweep.scatter(blurred), d, q)
 
     def _sum(self, strips: FloatImage, x: FloatImage, out: FloatImage) -> float:
         """Add strips of A' and the prior's part of x; give <x, out>."""
@@ -61,16 +61,20 @@ def reweighted(
     """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
     links = np.zeros((4, *stored.shape[1:]), np.float32)
     _link_weights(stored, weight, _POWERS, links)
-    ease = (1 / np.square(light_slope(stored, transfer))).astype(np.float32)
-    return Quadratic(sweep, trust, links, ease)
+    return Quadratic(sweep, trust, links, light_ease(stored, transfer))
 
 
 def conjugate_gradients(
     problem: Quadratic, latent: FloatImage, slope: FloatImage, limit: int
 ) -> FloatImage:
-    """Solve from latent by `limit` steps, preconditioned with l'^2; slope = minus the gradient."""
-    latent, r = latent.copy(), slope.copy()
-    d, q, strips = np.zeros_like(r), np.zeros_like(r), problem.sweep.strips()
+    """
+    Solve from latent by `limit` steps, preconditioned with l'^2.
+
+    slope: minus the gradient; written over.
+    """
+    latent, r = latent.copy(), slope
+    d, q = problem.sweep.directions
+    d[:] = 0
     products = np.zeros(r.shape[1], np.float32)
     _advance(latent, r, d, q, problem.ease, np.float32(0), products)
     rz, last = float(products.sum(dtype=np.float64)), math.inf
@@ -78,7 +82,7 @@ def conjugate_gradients(
         if rz <= 0:
             break
         _turn(d, r, problem.ease, np.float32(rz / last))
-        step = np.float32(rz / problem.normal(d, strips, q))
+        step = np.float32(rz / problem.normal(d, q))
         _advance(latent, r, d, q, problem.ease, step, products)
         rz, last = float(products.sum(dtype=np.float64)), rz
     return latent

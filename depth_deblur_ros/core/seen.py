@@ -20,7 +20,9 @@ def seen_inverse_depth(
     motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
 ) -> FloatImage:
     """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
-    return seen_by_pixel(seen_planes(motion, depth, camera, samples), depth.shape[1])
+    ray, packed = pack(motion, camera)
+    planes = seen_planes(depth, ray, packed, flow_parts(ray, packed, depth.shape), samples)
+    return seen_by_pixel(planes, depth.shape[1])
 
 
 def seen_by_pixel(planes: FloatImage, width: int) -> FloatImage:
@@ -29,13 +31,11 @@ def seen_by_pixel(planes: FloatImage, width: int) -> FloatImage:
 
 
 def seen_planes(
-    motion: Motion, depth: FloatImage, camera: CameraIntrinsics, samples: int
+    depth: FloatImage, ray: FloatImage, packed: FloatImage, flow: FloatImage, samples: int
 ) -> FloatImage:
-    """Give w_i as `seen_inverse_depth`, (H, samples, whole blocks), beyond W as at its rim."""
-    height, width = depth.shape
-    seen = np.empty((height, samples, whole_blocks(width)), np.float32)
-    ray, packed = pack(motion, camera)
-    _see(nearness_of(depth), ray, packed, flow_parts(ray, packed, depth.shape), seen)
+    """Give w_i (H, samples, W'), beyond W as at its rim; ray, packed and flow as below."""
+    seen = np.empty((depth.shape[0], samples, flow.shape[2]), np.float32)
+    _see(nearness_of(depth), ray, packed, flow, seen)
     return seen
 
 

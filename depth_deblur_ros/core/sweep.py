@@ -15,6 +15,7 @@ a thinned sweep blocks with a shorter blur have fewer instants (instants.py).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 import math
 from typing import Any
 
@@ -40,7 +41,7 @@ GUARD = 2  # px beyond the margin, so that neighbours of what is read exist in e
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """A of one motion, laid out for blocks."""
+    """A of one motion, laid out for blocks; its room is for one thread's work at a time."""
 
     nearness: FloatImage  # (H, N, W') inverse depth seen [1/m]
     flow: FloatImage  # (H, 4, W') a_x, a_y [px], b_x, b_y [px m] of the flow a + w b
@@ -68,27 +69,41 @@ class Sweep:
         below, right = height - self.room - planes.shape[1], width - self.room - planes.shape[2]
         return np.pad(planes, [(0, 0), (self.room, below), (self.room, right)], 'edge')
 
-    def gather(self, latent: FloatImage, weight: FloatImage) -> FloatImage:
-        """Give weight (3, H, W') times A L of latent planes."""
-        blurred = np.empty_like(weight)
+    def gather(
+        self, latent: FloatImage, weight: FloatImage, out: FloatImage | None = None
+    ) -> FloatImage:
+        """Give weight (3, H, W') times A L of latent planes, in `out` if given."""
+        blurred = np.empty_like(weight) if out is None else out
         _gather(latent, weight, blurred, *self._parts())
         return blurred
 
+    @cached_property
+    def taken(self) -> FloatImage:
+        """Room for blurred planes."""
+        height, _, width = self.nearness.shape
+        return np.empty((3, height, width), np.float32)
+
+    @cached_property
+    def directions(self) -> FloatImage:
+        """Room for two sets of latent planes (2, 3, h, w), zero beyond what steps reach."""
+        return np.zeros((2, *self.latent_shape), np.float32)
+
+    @cached_property
     def strips(self) -> FloatImage:
-        """Make room for what each thread of `scatter` writes: (n, 3, rows, w)."""
+        """Room for what each thread of `scatter` writes: (n, 3, rows, w)."""
         height = self.nearness.shape[0]
         count = min(get_num_threads(), height)
         _, _, wide = self.latent_shape
         return np.empty((count, 3, math.ceil(height / count) + 2 * self.room, wide), np.float32)
 
-    def scatter(self, blurred: FloatImage, strips: FloatImage) -> None:
-        """Spread blurred planes B; row j of strip k of n belongs to latent row k H // n + j."""
-        _scatter(blurred, strips, *self._parts())
+    def scatter(self, blurred: FloatImage) -> FloatImage:
+        """Spread blurred planes over `strips`; row j of strip k of n: latent row k H // n + j."""
+        _scatter(blurred, self.strips, *self._parts())
+        return self.strips
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
         """Give A' B in latent planes."""
-        strips = self.strips()
-        self.scatter(blurred, strips)
+        strips = self.scatter(blurred)
         latent = np.zeros(self.latent_shape, np.float32)
         height, count = self.nearness.shape[0], len(strips)
         for k, strip in enumerate(strips):
