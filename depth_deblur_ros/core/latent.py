@@ -34,6 +34,7 @@ SATURATED = 0.99  # stored values above may stand for any amount of light
 SPACING, OWN_SPACING = 1.5, 0.5
 WIDER, OWN_WIDER = 2.0, 1.0
 COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
+EARLIER = 2 / 3  # by how much noise may shorten all reweightings but the last
 CLEAN = 0.003  # sigma [stored units] up to which all steps are worth it
 # Least sigma [stored units]: 8 bit rounding for averaged values; real cameras hide their noise
 # from the estimate by demosaicing, and lens and shutter leave more unexplained.
@@ -47,15 +48,22 @@ class LatentSteps:
     prior: float
     outer: int
     inner: int
+    brief: bool = False  # fewer steps yet where noise hides what they bring
+    early: float = 1.0  # share of the steps in all reweightings but the last
+
+    def within(self, k: int) -> int:
+        """Give the steps in reweighting k."""
+        return self.inner if k == self.outer - 1 else math.ceil(self.early * self.inner)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Noise [stored units], steps, and px of the longest blur and of a block's for an instant."""
+    """Noise, and what is done at a size and at those below it."""
 
-    sigma: float
+    sigma: float  # stored units
     steps: LatentSteps
-    spacing: tuple[float, float]
+    spacing: tuple[float, float]  # px of the longest blur and of a block's for an instant
+    longer: float  # how much longer each reweighting is at half the size
 
 
 def noise_sigma(stored: FloatImage) -> float:
@@ -96,10 +104,12 @@ def restore_coarse_to_fine(
     """
     sigma = picture_sigma(blurred)
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
-    steps = replace(steps, inner=math.ceil(worth * steps.inner))
     wider = 1 - worth
+    haste = wider if steps.brief else 0.0
+    steps = replace(steps, inner=math.ceil(worth * steps.inner), early=1 - EARLIER * haste)
     spacing = (SPACING + WIDER * wider, OWN_SPACING + OWN_WIDER * wider)
-    light = _restored(Level(blurred, depth, camera), motion, Effort(sigma, steps, spacing))
+    effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste)
+    light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
 
 
@@ -108,7 +118,8 @@ def _restored(level: Level, motion: Motion, effort: Effort) -> FloatImage:
     first, steps, camera = None, effort.steps, level.camera
     width, height = camera.width // 2, camera.height // 2
     if min(width, height) >= MIN_SIDE:
-        coarse = LatentSteps(steps.prior, COARSE_OUTER, round(COARSE_LONGER * steps.inner))
+        inner = round(effort.longer * steps.inner)
+        coarse = replace(steps, outer=COARSE_OUTER, inner=inner)
         # Four pixels in one: half the noise.
         less = replace(effort, sigma=effort.sigma / 2, steps=coarse)
         half = _restored(scaled_level(level, width, height), motion, less)
@@ -154,12 +165,13 @@ def restored_light(
     start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
-    for _ in range(steps.outer):
+    for k in range(steps.outer):
         missing = sweep.gather(latent, within, sweep.taken)
         np.subtract(light, missing, out=missing)
         # What is saturated says only "at least this": drop it where the model gives more.
         trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
         problem = reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
-        latent = conjugate_gradients(problem, latent, problem.slope(missing, latent), steps.inner)
+        slope = problem.slope(missing, latent)
+        latent = conjugate_gradients(problem, latent, slope, steps.within(k))
     r = sweep.room
     return np.ascontiguousarray(np.moveaxis(latent[:, r : r + height, r : r + width], 0, 2))

@@ -132,7 +132,7 @@ def _restored(
         steps = LatentSteps(params.prior, params.reweightings, params.cg_steps)
         if params.mode == 'fast':
             inner = round(FAST_LONGER * steps.inner)
-            steps = LatentSteps(steps.prior, min(FAST_OUTER, steps.outer), inner)
+            steps = LatentSteps(steps.prior, min(FAST_OUTER, steps.outer), inner, brief=True)
         sharp = restore_coarse_to_fine(colour, depth, motion, camera, steps)
     return np.ascontiguousarray(sharp[..., 0]) if frame.image.ndim == 2 else sharp
 
