@@ -249,6 +249,27 @@ def test_the_restored_picture_is_closer_to_the_sharp_one(transfer, sigma):
     assert rms(found - sharp) < 0.5 * rms(taken - sharp)
 
 
+@pytest.mark.parametrize(('transfer', 'fewer'), [('srgb', True), ('linear', False)])
+def test_to_be_brief_saves_steps_where_there_is_noise(transfer, fewer, monkeypatch):
+    """Where none is found, sRGB is taken to hide some."""
+    taken, limits = blurred_cards(transfer)[1], []
+
+    def counted(problem, image, slope, limit):
+        limits[-1].append(limit)
+        return image
+
+    monkeypatch.setattr(latent, 'conjugate_gradients', counted)
+    monkeypatch.setattr(latent, 'picture_sigma', lambda _: 0.0)
+    for brief in (False, True):
+        limits.append([])
+        steps = LatentSteps(2.7, 2, 12, brief=brief)
+        restore_coarse_to_fine(taken, DEPTH, SIDEWAYS, CAMERA, steps)
+    usual, brief = limits
+    assert brief[-1] == usual[-1]
+    assert (brief[-2] < usual[-2]) == fewer
+    assert (brief != usual) == fewer
+
+
 def test_a_coarse_start_brings_the_same_steps_closer():
     camera = CameraIntrinsics(128.0, 128.0, 79.5, 63.5, 160, 128)
     depth, motion = np.full((128, 160), 2, np.float32), Motion(np.zeros(3), [16 / 64, 0, 0])
