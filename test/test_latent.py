@@ -1,5 +1,7 @@
 """The image step with the motion known: noise, prior, conjugate gradients."""
 
+from dataclasses import replace
+
 import cv2
 from depth_deblur_ros.core import latent
 from depth_deblur_ros.core.blur import blur_operator
@@ -253,6 +255,7 @@ def test_the_restored_picture_is_closer_to_the_sharp_one(transfer, sigma):
 def test_to_be_brief_saves_steps_where_there_is_noise(transfer, fewer, monkeypatch):
     """Where none is found, sRGB is taken to hide some."""
     taken, limits = blurred_cards(transfer)[1], []
+    camera = replace(CAMERA, transfer=transfer)
 
     def counted(problem, image, slope, limit):
         limits[-1].append(limit)
@@ -263,7 +266,7 @@ def test_to_be_brief_saves_steps_where_there_is_noise(transfer, fewer, monkeypat
     for brief in (False, True):
         limits.append([])
         steps = LatentSteps(2.7, 2, 12, brief=brief)
-        restore_coarse_to_fine(taken, DEPTH, SIDEWAYS, CAMERA, steps)
+        restore_coarse_to_fine(taken, DEPTH, SIDEWAYS, camera, steps)
     usual, brief = limits
     assert brief[-1] == usual[-1]
     assert (brief[-2] < usual[-2]) == fewer
