@@ -86,8 +86,8 @@ def _see(nearness, ray, motion, flow, seen):  # type: ignore[no-untyped-def]
                 view[y, x] = max(above[x], above[x + 1], below[x], below[x + 1])
         _fill_uncovered(view, nearness)
         for y in range(height):
-            for x in range(seen.shape[2]):
-                seen[y, i, x] = view[y, min(x, width - 1)]
+            seen[y, i, :width] = view[y]
+            seen[y, i, width:] = view[y, width - 1]
 
 
 @njit(cache=True, nogil=True)
