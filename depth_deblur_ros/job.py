@@ -22,6 +22,7 @@ from typing import NamedTuple
 from depth_deblur_ros.core.data import DeblurResult, InputError, RgbdFrame
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.folders import CameraFile, write_image, write_text
+from depth_deblur_ros.memory import keep_freed_memory
 
 APART = ('-m', 'depth_deblur_ros', 'job')  # the command that calls job_from_parent
 Progress = Callable[[int, int | None], None]
@@ -72,6 +73,7 @@ def run_job(job: Job, say: Callable[[str], None], progress: Progress | None = No
     """Do a job and say what came of it; give whether no frame failed or was lost."""
     from depth_deblur_ros.replay import replay
 
+    keep_freed_memory()
     exposure = job.exposure_s
     if job.camera and exposure is None:
         exposure = job.camera.exposure

@@ -1,4 +1,4 @@
-"""What the live node's process keeps of the memory that it has freed; glibc alone can be told."""
+"""What a process of many frames keeps of the memory it has freed; glibc alone can be told."""
 
 from __future__ import annotations
 

@@ -35,6 +35,7 @@ from depth_deblur_ros.core.data import CameraIntrinsics, Motion, RgbdFrame
 from depth_deblur_ros.core.params import params_from_mapping, SolverParams
 from depth_deblur_ros.core.solver import deblur
 from depth_deblur_ros.flags import read_params
+from depth_deblur_ros.memory import keep_freed_memory
 import numpy as np
 from speed_frames import blurred_frame, compute_bound, peers
 
@@ -231,6 +232,7 @@ def main() -> int:
     if args.one:
         one_result(args.one)
         return 0
+    keep_freed_memory()  # as the live node and replay do
     then = COMMITTED / 'speed.json'
     committed = json.loads(then.read_text()) if then.exists() else {'modes': {}}
     found: Row = {**committed, 'modes': modes(3 if args.short else args.runs)}
