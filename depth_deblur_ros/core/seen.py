@@ -61,8 +61,12 @@ def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> F
     tx, ty, tz = motion[:3, None, None] + motion[8:, None, None] * yn
     vx, vy, vz, fx, fy = motion[3:8]
     parts = np.empty((height, 4, xn.size), np.float32)
-    parts[:, 0] = fx * ((1 + xn * xn) * ty - (tx * xn + tz) * yn)
-    parts[:, 1] = fy * ((ty * yn + tz) * xn - (1 + yn * yn) * tx)
+    # In place: whole arrays of their own for each term would take twice the time.
+    np.multiply(fx * ty, 1 + xn * xn, out=parts[:, 0])
+    parts[:, 0] -= (fx * tx * yn) * xn
+    parts[:, 0] -= fx * tz * yn
+    np.multiply(fy * (ty * yn + tz), xn, out=parts[:, 1])
+    parts[:, 1] -= fy * (1 + yn * yn) * tx
     parts[:, 2] = fx * (vx - xn * vz)
     parts[:, 3] = fy * (vy - yn * vz)
     return parts
