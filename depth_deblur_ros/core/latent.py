@@ -30,7 +30,7 @@ import numpy as np
 
 SATURATED = 0.99  # stored values above may stand for any amount of light
 # px of the longest blur, and of a block's own, from one instant of the exposure to the next, and
-# what noise adds to them
+# what noise adds to them in brief
 SPACING, OWN_SPACING = 1.5, 0.5
 WIDER, OWN_WIDER = 2.0, 1.0
 COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
@@ -48,7 +48,7 @@ class LatentSteps:
     prior: float
     outer: int
     inner: int
-    brief: bool = False  # fewer steps yet where noise hides what they bring
+    brief: bool = False  # fewer steps and instants yet where noise hides what they bring
     early: float = 1.0  # share of the steps in all reweightings but the last
 
     def within(self, k: int) -> int:
@@ -99,14 +99,13 @@ def restore_coarse_to_fine(
     Give the sharp image (H, W, 3), stored values, under a known motion; depth (H, W) filled [m].
 
     At half the size an eighth of the work brings most of what is long and slow to converge, and
-    so on. Noise makes the prior weigh more, which takes fewer steps, and fewer instants do.
+    so on. Noise makes the prior weigh more, which takes fewer steps, and in brief fewer instants.
     """
     sigma = picture_sigma(blurred)
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
-    wider = 1 - worth
-    haste = wider if steps.brief else 0.0
+    haste = 1 - worth if steps.brief else 0.0
     steps = replace(steps, inner=math.ceil(worth * steps.inner), early=1 - EARLIER * haste)
-    spacing = (SPACING + WIDER * wider, OWN_SPACING + OWN_WIDER * wider)
+    spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
