@@ -109,12 +109,13 @@ def join(result: DeblurResult, context: Context, camera: CameraIntrinsics) -> Jo
     if exposure is None:
         shutter, exposure = shutter.measured(length)
     elif not agree(replace(exposure, doubt=TOLD_DOUBT), length):
-        return Joined(_signed(result, motion, result.motion.covariance), exposure, shutter)
+        return Joined(_signed(result, result.motion), exposure, shutter)
     along = np.outer(motion, motion) * exposure.doubt**2
     velocity = (motion / exposure.seconds, (covariance + along) / exposure.seconds**2)
     context = replace(context, glide=context.glide.measured(*velocity))
     p, spread = context.over(exposure.seconds)
-    joined = replace(_signed(result, p, spread), blur_px=blur_length(p, result.depth, camera))
+    settled = replace(result.motion, theta=p[:3], v=p[3:], covariance=spread)
+    joined = replace(_signed(result, settled), blur_px=blur_length(p, result.depth, camera))
     return Joined(joined, exposure, shutter, context.blur(exposure.seconds), velocity)
 
 
@@ -150,8 +151,7 @@ def _measured(p: Vector, covariance: Vector, context: Context) -> Exposure | Non
     return Exposure(length, spread / abs(length))
 
 
-def _signed(result: DeblurResult, p: Vector, covariance: Vector) -> DeblurResult:
-    motion = replace(result.motion, theta=p[:3], v=p[3:], covariance=covariance)
+def _signed(result: DeblurResult, motion: Motion) -> DeblurResult:
     return replace(result, motion=motion, sign_resolved=True)
 
 
@@ -182,4 +182,5 @@ def _claimed(result: DeblurResult, context: Context, camera: CameraIntrinsics) -
     covariance = covariance + exposure.doubt**2 * np.outer(p, p)
     claimed = replace(result, outcome=Outcome.SOLVED, quality=WORD, blur_px=blur_px)
     seen = context.blur(exposure.seconds)
-    return Joined(_signed(claimed, p, covariance), exposure, context.shutter, seen)
+    told = _signed(claimed, Motion.from_vector(p, covariance))
+    return Joined(told, exposure, context.shutter, seen)

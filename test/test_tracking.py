@@ -163,6 +163,24 @@ def test_a_frame_that_fails_takes_the_motion_of_its_neighbours():
     assert solve.starts == []
 
 
+def test_a_motion_that_is_not_believed_leaves_nothing_of_itself():
+    """One across what the neighbours tell, with rows that see different turns."""
+    tracker = Tracker(Knowing())
+    frames = [frame(i, exposure=EXPOSURE) for i in range(6)]
+    followed(frames[:5], tracker=tracker)
+
+    def astray(one, params, *, start=None):
+        found = Knowing()(one, params)
+        across = np.cross(found.motion.theta, [0, 0, 1])
+        return replace(found, motion=replace(found.motion, theta=across, rolling=0.1 * across))
+
+    tracker._solve = astray
+    found = tracker.follow(frames[5], MOTION)
+    assert found.result.sign_resolved
+    assert wrong(found, times(frames)[5]) < 0.4
+    assert not found.result.motion.rolling.any()
+
+
 def test_a_refused_frame_does_not_disturb_the_others():
     def refuse(frame, params, *, start=None):
         raise InputError('no')
