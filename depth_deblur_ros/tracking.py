@@ -144,8 +144,8 @@ class Tracker:
             known = True
         if told is None:
             self._compare(before, seen, glide.velocity if self._ahead else None)
-        height_per_yn = frame.camera.fy / frame.camera.height
-        reading = self._habits.readout * self._cadence.usual * height_per_yn
+        heights = frame.camera.fy / frame.camera.height  # from a row to that at yn + 1
+        reading = self._habits.readout * self._cadence.usual * heights
         context = Context(glide, self._shutter, told, self._cadence.usual, known, reading)
         return self._turned(frame.stamp_ns, context, params)
 

@@ -137,11 +137,12 @@ def blur_operator(
     """
     ray, packed = pack(motion, camera)
     flow = flow_parts(ray, packed, depth.shape)
-    near = np.pad(nearness_of(depth), [(0, 0), (0, flow.shape[2] - camera.width)], 'edge')
-    longest = math.sqrt(_largest(near[:, None], flow)[2])
+    near = nearness_of(depth)
+    blocks = np.pad(near, [(0, 0), (0, flow.shape[2] - camera.width)], 'edge')
+    longest = math.sqrt(_largest(blocks[:, None], flow)[2])
     least = math.ceil(MIN_SAMPLES / spacing)
     samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), least, MAX_SAMPLES))
-    seen = seen_planes(depth, ray, packed, flow, samples)
+    seen = seen_planes(near, ray, packed, flow, samples)
     reach = max(_largest(seen, flow)[:2]) / 2
     margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: interpolation
     return BlurOperator(ray, packed, seen_by_pixel(seen, camera.width), margin, flow)

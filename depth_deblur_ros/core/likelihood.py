@@ -8,7 +8,7 @@ average is taken over the best image and samples of what is left open about it, 
 one image step, docs/method.md (16) to (18).
 
 Notation: B blurred grey light; L = mu + s latent light, mu the best for p, s the rest,
-s ~ N(0, sigma^2 (A' W A + R)^-1); R the prior's links (latent.py), W = 1 / l'^2;
+s ~ N(0, sigma^2 (A' W A + R)^-1); R the prior's links (quadratic.py), W = 1 / l'^2;
 J x = d (A_p x) / d p.
 
     g(p) = (<J mu, W (A mu - B)> + mean over s of <J s, W A s>) / sigma^2

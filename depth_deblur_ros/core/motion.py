@@ -178,11 +178,11 @@ def _leftover(columns: Array, blur: BlurOperator, limit: int) -> Array:
 
 
 def blur_and_slope(p: Vector, latent: Array, blur: BlurOperator) -> tuple[Array, Array]:
-    """Give A_p L (H, W, 3) and its slope (H, W, 3, 6) in p; what is seen when stays as in blur."""
+    """Give A_p L (H, W, 3) and its slope (H, W, 3, 6) in p (6,); the rest stays as in blur."""
     shape = (*blur.inverse_depth.shape[:2], 3)
     value, slope = np.empty(shape, latent.dtype), np.empty((*shape, 6), latent.dtype)
     focal, rolling = np.split(blur.motion[6:].astype(np.float64), [2])
-    whole = np.concatenate([p[:6], rolling])
+    whole = np.concatenate([p, rolling])
     _blur_and_slope(latent, blur.inverse_depth, blur.ray, whole, focal, blur.margin, value, slope)
     return value, slope
 

@@ -214,8 +214,8 @@ def slope_and_bend(q: Vector, scales: list[Scale]) -> tuple[Vector, Vector]:
 
 
 def _by_rows(qs: Vector) -> Vector:
-    """Let rows see different turns: q (m, 9) of (m, 6), or of themselves."""
-    return np.pad(qs, [(0, 0), (0, 9 - qs.shape[1])])
+    """Give q (m, 9) of (m, 6): no row sees another turn yet."""
+    return np.pad(qs, [(0, 0), (0, 3)])
 
 
 def _choose(qs: Vector, scales: list[Scale]) -> Vector:

@@ -21,7 +21,8 @@ def seen_inverse_depth(
 ) -> FloatImage:
     """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
     ray, packed = pack(motion, camera)
-    planes = seen_planes(depth, ray, packed, flow_parts(ray, packed, depth.shape), samples)
+    flow = flow_parts(ray, packed, depth.shape)
+    planes = seen_planes(nearness_of(depth), ray, packed, flow, samples)
     return seen_by_pixel(planes, depth.shape[1])
 
 
@@ -31,11 +32,11 @@ def seen_by_pixel(planes: FloatImage, width: int) -> FloatImage:
 
 
 def seen_planes(
-    depth: FloatImage, ray: FloatImage, packed: FloatImage, flow: FloatImage, samples: int
+    nearness: FloatImage, ray: FloatImage, packed: FloatImage, flow: FloatImage, samples: int
 ) -> FloatImage:
     """Give w_i (H, samples, W'), beyond W as at its rim; ray, packed and flow as below."""
-    seen = np.empty((depth.shape[0], samples, flow.shape[2]), np.float32)
-    _see(nearness_of(depth), ray, packed, flow, seen)
+    seen = np.empty((len(nearness), samples, flow.shape[2]), np.float32)
+    _see(nearness, ray, packed, flow, seen)
     return seen
 
 
