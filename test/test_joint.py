@@ -101,9 +101,9 @@ def test_disagreement_softens():
     bends = np.array([np.eye(6) * 1e4] * 4)
     optimum = np.ones(6)
     agree = -bends @ optimum
-    assert joint._softening(agree, bends) == joint.SOFTEST
+    assert joint._softening(agree, bends, 10.0) == joint.SOFTEST
     apart = agree + 1e4 * np.array([[1.0], [-1], [1], [-1]])
-    assert joint._softening(apart, bends) > 100 * joint.SOFTEST
+    assert joint._softening(apart, bends, 10.0) > 100 * joint.SOFTEST
 
 
 def test_the_curvature_follows_a_quadratic():

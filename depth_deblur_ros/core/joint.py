@@ -39,10 +39,10 @@ SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 MOVES = 4
 LONGEST_MOVE, LEAST_MOVE = 1.0, 0.1  # px
-SOFTEST, DISSENT = (
-    10.0,
-    10.0,
-)  # what the likelihood is divided by: at least; per chi^2 of the parts
+# What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
+# by a curve follows sRGB's only about, and the parts share what that gets wrong.
+SOFTEST = 10.0
+DISSENT = {'linear': 10.0, 'srgb': 40.0}
 BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 
 
@@ -66,7 +66,7 @@ def refine(
     p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
     parts = _parts(Level(light, depth, camera), length(p), budget)
     begun = _each(lambda part: _begun(part, p), parts)
-    return _moved(begun, p, certainty, length)
+    return _moved(begun, p, certainty, length, DISSENT[camera.transfer])
 
 
 def _moved(
@@ -74,13 +74,14 @@ def _moved(
     start: Vector,
     certainty: Vector,
     length: Callable[[Vector], float],
+    dissent: float,
 ) -> Motion:
     """Go where the slope of the likelihood and the pull of the start balance."""
     parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), start
     bend = bends.sum(0)
     for k in range(MOVES):
-        soft = _softening(gs, bends)
+        soft = _softening(gs, bends, dissent)
         force = gs.sum(0) / soft + certainty @ (p - start)
         move = -np.linalg.solve(bend / soft + certainty, force)
         move *= min(1.0, LONGEST_MOVE / max(length(move), 1e-9))
@@ -117,12 +118,12 @@ def _each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]
         return list(pool.map(alone, parts))
 
 
-def _softening(gs: Vector, bends: Vector) -> float:
-    """Give by how much the parts (n, 9), (n, 9, 9) are off their common optimum, in chi^2."""
+def _softening(gs: Vector, bends: Vector, dissent: float) -> float:
+    """Give the divisor: dissent per chi^2 of parts (n, 9), (n, 9, 9) about their optimum."""
     common = -np.linalg.solve(bends.sum(0), gs.sum(0))
     left = gs + bends @ common
     chi = float(np.sum(left * np.linalg.solve(bends, left[..., None])[..., 0]))
-    return max(SOFTEST, DISSENT * chi / float(gs[1:].size))
+    return max(SOFTEST, dissent * chi / float(gs[1:].size))
 
 
 def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:

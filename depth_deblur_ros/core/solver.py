@@ -86,7 +86,7 @@ def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, budget: int) -> 
     light = light_from_stored(frame.image, frame.camera.transfer)
     light = _grey(light, _shares(frame.image))
     motion = refine(light, depth, frame.camera, found, budget)
-    return calibrated(motion, found.axes, OF_LIKELIHOOD * found.doubt)
+    return calibrated(motion, found.axes, OF_LIKELIHOOD[frame.camera.transfer] * found.doubt)
 
 
 def restore_known(

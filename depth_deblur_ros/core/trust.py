@@ -23,7 +23,8 @@ FURTHER = 3.0  # px of further blur
 ENOUGH = 15_000  # pixels or more that are looked at; the ratio is then good to 0.002
 # By scripts/calibrate.py: shares of the covariances that the spectra and the likelihood give, and
 # what no picture tells better of q: two shifts, roll, zoom, two parallaxes [px].
-OF_SPECTRA, OF_LIKELIHOOD = 0.12, 0.36
+OF_SPECTRA = 0.12
+OF_LIKELIHOOD = {'linear': 0.36, 'srgb': 0.18}
 LEAST_ERROR = (0.07, 0.07, 0.12, 0.05, 0.03, 0.03)
 
 
