@@ -271,7 +271,7 @@ def test_what_is_seen_is_its_slow_twin(seed, samples):
     parts = rng.normal(0, 3, (1, 4, 1)) + rng.normal(0, 0.01, (height, 4, width))
     f = np.stack([parts[:, k] + nearness * parts[:, k + 2] for k in (0, 1)], -1)
     seen = np.empty((height, samples, width + 3))
-    _see(nearness, ray, motion, parts, seen)
+    _see(0, samples, nearness, ray, motion, parts, seen)
     slow = oracle.seen(nearness, ray, motion, f, samples)
     np.testing.assert_allclose(np.moveaxis(seen[..., :width], 1, 2), slow, rtol=1e-6)
     assert (seen[..., width:] == seen[..., width - 1 : width]).all()

@@ -68,14 +68,15 @@ def restored(taken, blur, transfer, sigma, steps):
 
 def links_of(stored):
     links = np.zeros((4, *stored.shape[1:]), np.float32)
-    _link_weights(stored, WEIGHT, _POWERS, links)
+    _link_weights(0, stored.shape[1], stored, WEIGHT, _POWERS, links)
     return links
 
 
 def smooth(u, links, ease):
     """Give the prior's slope at u and <u, slope>, in latent planes; nothing comes from A'."""
     out, products = np.zeros_like(u), np.zeros(u.shape[1], np.float32)
-    _sum_rows(np.zeros((1, *u.shape), np.float32), u.shape[1], u, links, ease, out, products)
+    strips, rows = np.zeros((1, *u.shape), np.float32), u.shape[1]
+    _sum_rows(0, rows, strips, rows, u, links, ease, out, products)
     return out, products.sum()
 
 

@@ -22,7 +22,8 @@ from depth_deblur_ros.core.instants import flow_at
 from depth_deblur_ros.core.lanes import greatest, larger, load, splat, whole_blocks, WIDTH
 from depth_deblur_ros.core.seen import flow_parts, nearness_of, pack, seen_by_pixel, seen_planes
 from depth_deblur_ros.core.sweep import Sweep, sweep_of
-from numba import get_num_threads, njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import get_num_threads, njit
 import numpy as np
 import numpy.typing as npt
 
@@ -78,7 +79,8 @@ class BlurOperator:
         if latent.dtype == np.float32:
             return self._apply_by_blocks(latent)
         blurred = np.empty((*self.inverse_depth.shape[:2], 3), latent.dtype)
-        _gather(latent, self.inverse_depth, self.ray, self.motion, self.margin, blurred)
+        told = self.inverse_depth, self.ray, self.motion, self.margin
+        on_threads(_gather, len(blurred), latent, *told, blurred)
         return blurred
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
@@ -90,7 +92,8 @@ class BlurOperator:
         height, width, _ = self.latent_shape
         depth_of_strip = math.ceil(rows / strips) + 2 * self.margin
         parts = np.zeros((strips, depth_of_strip, width, 3), blurred.dtype)
-        _scatter(blurred, self.inverse_depth, self.ray, self.motion, self.margin, parts)
+        told = self.inverse_depth, self.ray, self.motion, self.margin
+        on_threads(_scatter, strips, blurred, *told, parts)
         latent = np.zeros((height, width, 3), blurred.dtype)
         for k in range(strips):
             first = k * rows // strips
@@ -151,16 +154,16 @@ def blur_operator(
 def _largest(nearness: FloatImage, flow: FloatImage) -> tuple[float, float, float]:
     """Give the largest |x| [px], |y| [px] and squared length [px^2] of the flow, w (H, N, W)."""
     rows = np.empty((nearness.shape[0], 3), np.float32)
-    _largest_of_rows(nearness, flow, rows)
+    on_threads(_largest_of_rows, len(rows), nearness, flow, rows)
     x, y, square = rows.max(axis=0).tolist()
     return x, y, square
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _largest_of_rows(nearness, flow, rows):  # type: ignore[no-untyped-def]
-    height, samples, width = nearness.shape
+@njit(**SHARED)
+def _largest_of_rows(first, end, nearness, flow, rows):  # type: ignore[no-untyped-def]
+    _, samples, width = nearness.shape
     near, parts = nearness.reshape(-1), flow.reshape(-1)
-    for y in prange(height):
+    for y in range(first, end):
         px = py = square = zero = splat(np.float32(0))
         for k in range(width // WIDTH):
             ax, ay, bx, by = flow_at(y, k, parts, width)
@@ -197,15 +200,15 @@ def _cell(cx, cy, dx, dy, far):  # type: ignore[no-untyped-def]
 
 # Flat images and unsigned indices below: numba checks signed ones for negative values, which
 # costs a third of the time.
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _gather(latent, seen, ray, motion, margin, blurred):  # type: ignore[no-untyped-def]
-    height, width, samples = seen.shape
+@njit(fastmath=True, **SHARED)
+def _gather(first, end, latent, seen, ray, motion, margin, blurred):  # type: ignore[no-untyped-def]
+    _, width, samples = seen.shape
     wide = latent.shape[1]
     far = np.float32(margin - 1)  # what lies farther is taken from there
     flat = latent.reshape(-1)
     share, half = np.float32(1.0 / samples), np.float32(0.5)
     row, one, two, three = np.uint32(3 * wide), np.uint32(1), np.uint32(2), np.uint32(3)
-    for y in prange(height):
+    for y in range(first, end):
         for x in range(width):
             ax, ay, bx, by = _flow_parts(x, y, ray, width, motion)
             r = g = b = flat[0] * 0
@@ -233,18 +236,18 @@ def _gather(latent, seen, ray, motion, margin, blurred):  # type: ignore[no-unty
             blurred[y, x, 0], blurred[y, x, 1], blurred[y, x, 2] = share * r, share * g, share * b
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _scatter(blurred, seen, ray, motion, margin, parts):  # type: ignore[no-untyped-def]
+@njit(fastmath=True, **SHARED)
+def _scatter(first, end, blurred, seen, ray, motion, margin, parts):  # type: ignore[no-untyped-def]
     """Spread each blurred pixel over what it read; strip k of rows writes to parts[k] alone."""
     height, width, samples = seen.shape
     strips, wide = parts.shape[0], parts.shape[2]
     far = np.float32(margin - 1)  # a strip ends there
     share, half = np.float32(1.0 / samples), np.float32(0.5)
     row, three = np.uint32(3 * wide), np.uint32(3)
-    for k in prange(strips):
-        first, end = np.int64(k) * height // strips, np.int64(k + 1) * height // strips
+    for k in range(first, end):
+        top, bottom = k * height // strips, (k + 1) * height // strips
         flat = parts[k].reshape(-1)
-        for y in range(first, end):
+        for y in range(top, bottom):
             for x in range(width):
                 ax, ay, bx, by = _flow_parts(x, y, ray, width, motion)
                 cx, cy = np.float32(x + margin), np.float32(y + margin)
@@ -255,7 +258,7 @@ def _scatter(blurred, seen, ray, motion, margin, parts):  # type: ignore[no-unty
                     near = seen[y, x, i]
                     dx, dy = t * (ax + near * bx), t * (ay + near * by)
                     x0, y0, w00, w01, w10, w11 = _cell(cx, cy, dx, dy, far)
-                    p = np.uint32((y0 - np.uint32(first)) * row + three * x0)
+                    p = np.uint32((y0 - np.uint32(top)) * row + three * x0)
                     for c in range(3):
                         j = np.uint32(p + np.uint32(c))
                         flat[j] += w00 * spread[c]

@@ -22,7 +22,8 @@ import math
 
 import cv2
 from depth_deblur_ros.core.data import FloatImage, InputError
-from numba import config, get_num_threads, njit, prange, set_num_threads
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import config, get_num_threads, njit, set_num_threads
 import numpy as np
 import numpy.typing as npt
 
@@ -54,7 +55,8 @@ def fill_depth(depth: FloatImage, guide: FloatImage, *, threads: int) -> FloatIm
     colours = np.ascontiguousarray(guide).reshape(*depth.shape, -1)
     before = get_num_threads()
     set_num_threads(min(threads, config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-    _fill(filled, measured, colours, *find_seeds(filled, measured, colours))
+    seeds = find_seeds(filled, measured, colours)
+    on_threads(_fill, len(filled), filled, measured, colours, *seeds)
     set_num_threads(before)
     return filled
 
@@ -80,12 +82,12 @@ def find_seeds(
     return labels.view(np.uint32), seeds
 
 
-@njit(cache=True, nogil=True, error_model='numpy', parallel=True)
-def _fill(depth, measured, colours, nearest, seeds):  # type: ignore[no-untyped-def]
+@njit(**SHARED)
+def _fill(first, end, depth, measured, colours, nearest, seeds):  # type: ignore[no-untyped-def]
     """Write the weighted mean of its seeds into every hole pixel of depth."""
     height, width = measured.shape
     per_colour = np.float32(1 / (2 * COLOUR_SIGMA**2 * colours.shape[2]))
-    for y in prange(height):
+    for y in range(first, end):
         z, cost, closeness = np.empty((3, SEEDS), np.float32)
         for x in range(width):
             if measured[y, x]:

@@ -12,7 +12,8 @@ import math
 
 from depth_deblur_ros.core.data import FloatImage
 from depth_deblur_ros.core.lanes import greatest, larger, least, load, smaller, splat, store, WIDTH
-from numba import njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -32,7 +33,7 @@ def thinned(
     if not spacing:
         return nearness, shares
     kept = np.empty_like(nearness)
-    _thin(nearness, flow, np.float32(spacing), kept, shares)
+    on_threads(_thin, height, nearness, flow, np.float32(spacing), kept, shares)
     return kept, shares
 
 
@@ -42,7 +43,7 @@ def cells_of(
     """Give the least offset x, y that a block reads, and how many x, y (H, W' / 16, N, 4)."""
     height, samples, width = nearness.shape
     cells = np.empty((height, width // WIDTH, samples, 4), np.int16)
-    _find_cells(nearness, flow, shares, far, cells)
+    on_threads(_find_cells, height, nearness, flow, shares, far, cells)
     return cells
 
 
@@ -54,12 +55,12 @@ def flow_at(y, k, flow, width):  # type: ignore[no-untyped-def]
     return x, y, load(flow, at + 2 * width), load(flow, at + 3 * width)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _thin(nearness, flow, spacing, kept, shares):  # type: ignore[no-untyped-def]
+@njit(**SHARED)
+def _thin(first, end, nearness, flow, spacing, kept, shares):  # type: ignore[no-untyped-def]
     """Give each block as many instants as its blur is long; keep what it sees at those."""
-    height, samples, width = nearness.shape
+    _, samples, width = nearness.shape
     seen, parts, out = nearness.reshape(-1), flow.reshape(-1), kept.reshape(-1)
-    for y in prange(height):
+    for y in range(first, end):
         for k in range(width // WIDTH):
             ax, ay, bx, by = flow_at(y, k, parts, width)
             at, square = y * samples * width + k * WIDTH, splat(np.float32(0))
@@ -94,12 +95,12 @@ def _span(lanes):  # type: ignore[no-untyped-def]
     return first, np.intp(np.floor(greatest(lanes))) - first + 2
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _find_cells(nearness, flow, shares, far, cells):  # type: ignore[no-untyped-def]
+@njit(**SHARED)
+def _find_cells(first, end, nearness, flow, shares, far, cells):  # type: ignore[no-untyped-def]
     """Write where each block begins to read at each instant, and how many columns and rows."""
-    height, samples, width = nearness.shape
+    _, samples, width = nearness.shape
     near, parts = nearness.reshape(-1), flow.reshape(-1)
-    for y in prange(height):
+    for y in range(first, end):
         for k in range(width // WIDTH):
             ax, ay, bx, by = flow_at(y, k, parts, width)
             for i in range(samples):

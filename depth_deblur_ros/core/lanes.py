@@ -180,6 +180,16 @@ def whole(typing: Any, lanes: Any) -> Any:
 
 
 @_instruction  # type: ignore[untyped-decorator]
+def bits_of(typing: Any, value: Any) -> Any:
+    """Take the bits of one float32 as a whole number."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.bitcast(values[0], _INDEX)
+
+    return types.int32(types.float32), build
+
+
+@_instruction  # type: ignore[untyped-decorator]
 def where_positive(typing: Any, sign: Any, a: Any, b: Any) -> Any:
     """Give a where sign > 0, else b."""
 

@@ -10,7 +10,9 @@ of v(l) even steps within each octave of l, counted by the bits of the float.
 from __future__ import annotations
 
 from depth_deblur_ros.core.data import FloatImage
-from numba import njit, prange
+from depth_deblur_ros.core.lanes import bits_of
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -74,24 +76,24 @@ def _mapped(values: FloatImage, look_up, table: FloatImage) -> FloatImage:  # ty
     """Send each value through a table."""
     flat = np.ascontiguousarray(values, np.float32).reshape(-1)
     found = np.empty_like(flat)
-    look_up(flat, table, found)
+    on_threads(look_up, flat.size, flat, table, found)
     return found.reshape(values.shape)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _look_up(values, table, found):  # type: ignore[no-untyped-def]
-    for k in prange(values.size):
+@njit(**SHARED)
+def _look_up(first, end, values, table, found):  # type: ignore[no-untyped-def]
+    for k in range(np.uintp(first), np.uintp(end)):
         place = STEPS * np.float64(min(max(values[k], np.float32(0)), np.float32(1)))
         i = np.uint32(place)
         found[k] = table[i] + (place - i) * (table[i + np.uint32(1)] - table[i])
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _look_up_octaves(values, table, found):  # type: ignore[no-untyped-def]
-    bits, part = values.view(np.int32), np.float32(2.0 ** (OCTAVE_BITS - 23))
-    for k in prange(values.size):
+@njit(**SHARED)
+def _look_up_octaves(first, end, values, table, found):  # type: ignore[no-untyped-def]
+    part = np.float32(2.0 ** (OCTAVE_BITS - 23))
+    for k in range(np.uintp(first), np.uintp(end)):
         if values[k] > np.float32(KNEE):
-            place = np.uint32(min(bits[k], 127 << 23) - LEAST_BITS)
+            place = np.uint32(min(bits_of(values[k]), 127 << 23) - LEAST_BITS)
             i = place >> np.uint32(23 - OCTAVE_BITS)
             rest = part * np.float32(place & np.uint32((1 << (23 - OCTAVE_BITS)) - 1))
             found[k] = table[i] + rest * (table[i + np.uint32(1)] - table[i])

@@ -23,7 +23,8 @@ from enum import StrEnum
 from depth_deblur_ros.core.blur import BlurOperator
 from depth_deblur_ros.core.data import Vector
 from depth_deblur_ros.core.energy import data_weight, motion_term, smoothness_term
-from numba import njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -183,14 +184,15 @@ def blur_and_slope(p: Vector, latent: Array, blur: BlurOperator) -> tuple[Array,
     value, slope = np.empty(shape, latent.dtype), np.empty((*shape, 6), latent.dtype)
     focal, rolling = np.split(blur.motion[6:].astype(np.float64), [2])
     whole = np.concatenate([p, rolling])
-    _blur_and_slope(latent, blur.inverse_depth, blur.ray, whole, focal, blur.margin, value, slope)
+    told = latent, blur.inverse_depth, blur.ray, whole, focal, blur.margin
+    on_threads(_blur_and_slope, len(value), *told, value, slope)
     return value, slope
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _blur_and_slope(latent, seen, ray, p, focal, margin, value, slope):  # type: ignore[no-untyped-def]
-    height, width = seen.shape[:2]
-    for y in prange(height):
+@njit(**SHARED)
+def _blur_and_slope(first, end, latent, seen, ray, p, focal, margin, value, slope):  # type: ignore[no-untyped-def]
+    width = seen.shape[1]
+    for y in range(first, end):
         lean = np.zeros((3, 5))  # of each channel: value, then dL times t and t w down each axis
         for x in range(width):
             xn, yn = np.float64(ray[x]), np.float64(ray[width + y])
@@ -214,7 +216,7 @@ def _blur_and_slope(latent, seen, ray, p, focal, margin, value, slope):  # type:
                 slope[y, x, c, 5] = -xn * hx - yn * hy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _gather(latent, near, x, y, flow, lean):  # type: ignore[no-untyped-def]
     """Average L and its slope over the instants, along the flow (a, then b) of one pixel."""
     high, wide = latent.shape[0] - 1.001, latent.shape[1] - 1.001

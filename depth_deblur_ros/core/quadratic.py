@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import math
 
 from depth_deblur_ros.core.data import FloatImage
-from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
+from depth_deblur_ros.core.lanes import bits_of, load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_ease
 from depth_deblur_ros.core.sweep import GUARD, Sweep
-from numba import njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
 
 EPSILON = 0.01  # stored units; differences below this count as noise
@@ -51,7 +52,7 @@ class Quadratic:
         """Add strips of A' and the prior's part of x; give <x, out>."""
         products = np.zeros(x.shape[1:2], np.float32)
         rows = self.trust.shape[1]
-        _sum_rows(strips, rows, x, self.links, self.ease, out, products)
+        on_threads(_sum_rows, len(products), strips, rows, x, self.links, self.ease, out, products)
         return float(products.sum(dtype=np.float64))
 
 
@@ -60,7 +61,7 @@ def reweighted(
 ) -> Quadratic:
     """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
     links = np.zeros((4, *stored.shape[1:]), np.float32)
-    _link_weights(stored, weight, _POWERS, links)
+    on_threads(_link_weights, stored.shape[1], stored, weight, _POWERS, links)
     return Quadratic(sweep, trust, links, light_ease(stored, transfer))
 
 
@@ -76,14 +77,15 @@ def conjugate_gradients(
     d, q = problem.sweep.directions
     d[:] = 0
     products = np.zeros(r.shape[1], np.float32)
-    _advance(latent, r, d, q, problem.ease, np.float32(0), products)
+    rows = r.shape[1]
+    on_threads(_advance, rows, latent, r, d, q, problem.ease, np.float32(0), products)
     rz, last = float(products.sum(dtype=np.float64)), math.inf
     for _ in range(limit):
         if rz <= 0:
             break
-        _turn(d, r, problem.ease, np.float32(rz / last))
+        on_threads(_turn, rows, d, r, problem.ease, np.float32(rz / last))
         step = np.float32(rz / problem.normal(d, q))
-        _advance(latent, r, d, q, problem.ease, step, products)
+        on_threads(_advance, rows, latent, r, d, q, problem.ease, step, products)
         rz, last = float(products.sum(dtype=np.float64)), rz
     return latent
 
@@ -99,22 +101,21 @@ _POWERS = (
 ).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _link_weights(stored, weight, powers, links):  # type: ignore[no-untyped-def]
+@njit(fastmath=True, **SHARED)
+def _link_weights(first, end, stored, weight, powers, links):  # type: ignore[no-untyped-def]
     """Weigh the links to the neighbours right, below, below right, below left: [IRLS]."""
     _, height, width = stored.shape
     rest_of, mask = np.float32(2.0**-_POWER_SHIFT), np.uint32((1 << _POWER_SHIFT) - 1)
     third, floor = np.float32(1 / 3), np.float32(EPSILON * EPSILON)
-    for y in prange(GUARD, height - GUARD):
+    for y in range(max(first, GUARD), min(end, height - GUARD)):
         mean = np.empty(width, np.float32)
-        bits = mean.view(np.int32)
         for k in range(4):
             down, aside = min(k, 1), (1, 0, 1, -1)[k]
-            first, end = max(-aside, 0), width - max(aside, 0)
+            left, right = max(-aside, 0), width - max(aside, 0)
             if down and y == height - GUARD - 1:
                 continue
             mean[:] = 1
-            for x in range(first, end):
+            for x in range(left, right):
                 s = np.float32(0)
                 for c in range(3):
                     d = stored[c, y + down, x + aside] - stored[c, y, x]
@@ -122,8 +123,8 @@ def _link_weights(stored, weight, powers, links):  # type: ignore[no-untyped-def
                 mean[x] = third * s + floor
             # Diagonal links are longer: half the weight.
             share = weight if k < 2 else weight / 2
-            for x in range(first, end):
-                place = np.uint32(bits[x] - _POWER_FROM)
+            for x in range(left, right):
+                place = np.uint32(bits_of(mean[x]) - _POWER_FROM)
                 i, rest = place >> np.uint32(_POWER_SHIFT), rest_of * np.float32(place & mask)
                 links[k, y, x] = share * (powers[i] + rest * (powers[i + 1] - powers[i]))
 
@@ -134,7 +135,7 @@ def _pull(u, links, ease, p, n, link):  # type: ignore[no-untyped-def]
     return load(links, link) * (load(u, p) - load(u, n)) * smaller(load(ease, p), load(ease, n))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _add_prior(y, x, links, ease, out, products, room):  # type: ignore[no-untyped-def]
     """Add the prior's quadratic form of x to one row of out; all flat but out (3, h, w)."""
     _, high, wide = out.shape
@@ -154,14 +155,14 @@ def _add_prior(y, x, links, ease, out, products, room):  # type: ignore[no-untyp
     products[y] = total(product, room)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sum_rows(strips, rows, x, links, ease, out, products):  # type: ignore[no-untyped-def]
+@njit(**SHARED)
+def _sum_rows(first, end, strips, rows, x, links, ease, out, products):  # type: ignore[no-untyped-def]
     """Write the sum of strips of A' (of `rows` rows of B) and the prior's part of x into out."""
     high = out.shape[1]
     count, _, depth, _ = strips.shape
     wide = out.shape[2]
-    flat = (x.reshape(-1), links.reshape(-1), ease.reshape(-1))
-    for y in prange(GUARD, high - GUARD):
+    x_flat, links_flat, ease_flat = x.reshape(-1), links.reshape(-1), ease.reshape(-1)
+    for y in range(max(first, GUARD), min(end, high - GUARD)):
         for c in range(3):
             for i in range(wide):
                 out[c, y, i] = 0
@@ -170,14 +171,15 @@ def _sum_rows(strips, rows, x, links, ease, out, products):  # type: ignore[no-u
                 if 0 <= j < depth:
                     for i in range(wide):
                         out[c, y, i] += strips[k, c, j, i]
-        _add_prior(y, *flat, out, products, np.empty(WIDTH, np.float32))
+        room = np.empty(WIDTH, np.float32)
+        _add_prior(y, x_flat, links_flat, ease_flat, out, products, room)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _advance(latent, r, d, q, ease, step, products):  # type: ignore[no-untyped-def]
+@njit(fastmath=True, **SHARED)
+def _advance(first, end, latent, r, d, q, ease, step, products):  # type: ignore[no-untyped-def]
     """Go along d: latent + step d, r - step q; give <r, r / ease> of each row."""
-    _, height, width = r.shape
-    for y in prange(height):
+    width = r.shape[2]
+    for y in range(first, end):
         s = np.float32(0)
         for c in range(3):
             for x in range(width):
@@ -187,11 +189,11 @@ def _advance(latent, r, d, q, ease, step, products):  # type: ignore[no-untyped-
         products[y] = s
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True)
-def _turn(d, r, ease, share):  # type: ignore[no-untyped-def]
+@njit(fastmath=True, **SHARED)
+def _turn(first, end, d, r, ease, share):  # type: ignore[no-untyped-def]
     """Turn d to r / ease + share d."""
-    _, height, width = r.shape
-    for y in prange(height):
+    width = r.shape[2]
+    for y in range(first, end):
         for c in range(3):
             for x in range(width):
                 d[c, y, x] = r[c, y, x] / ease[c, y, x] + share * d[c, y, x]

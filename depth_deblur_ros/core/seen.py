@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
 from depth_deblur_ros.core.lanes import whole_blocks
-from numba import njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
 
 MIN_INVERSE_DEPTH = 1e-4  # 1/m; beyond 10 km nothing moves
@@ -36,7 +37,7 @@ def seen_planes(
 ) -> FloatImage:
     """Give w_i (H, samples, W'), beyond W as at its rim; ray, packed and flow as below."""
     seen = np.empty((len(nearness), samples, flow.shape[2]), np.float32)
-    _see(nearness, ray, packed, flow, seen)
+    on_threads(_see, samples, nearness, ray, packed, flow, seen)
     return seen
 
 
@@ -73,12 +74,12 @@ def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> F
     return parts
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _see(nearness, ray, motion, flow, seen):  # type: ignore[no-untyped-def]
-    """Warp the inverse depth (H, W) to each instant; seen (H, N, W or more) is written."""
+@njit(**SHARED)
+def _see(first, end, nearness, ray, motion, flow, seen):  # type: ignore[no-untyped-def]
+    """Warp the inverse depth (H, W) to some instants; seen (H, N, W or more) is written."""
     height, width = nearness.shape
     samples = seen.shape[1]
-    for i in prange(samples):
+    for i in range(first, end):
         t = np.float32((i + 0.5) / samples - 0.5)
         # Cell (y, x) of the four pixels from (y - 1, x - 1) on: its nearest surface.
         cells = np.zeros((height + 1, width + 1), np.float32)
@@ -91,11 +92,11 @@ def _see(nearness, ray, motion, flow, seen):  # type: ignore[no-untyped-def]
                 view[y, x] = max(above[x], above[x + 1], below[x], below[x + 1])
         _fill_uncovered(view, nearness)
         for y in range(height):
-            seen[y, i, :width] = view[y]
-            seen[y, i, width:] = view[y, width - 1]
+            for x in range(seen.shape[2]):
+                seen[y, i, x] = view[y, min(x, width - 1)]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _mark_row(y, t, nearness, ray, motion, flow, cells):  # type: ignore[no-untyped-def]
     """Move the points of one row and leave each in the cell where it comes to stand."""
     high, wide = np.float32(cells.shape[0]), np.float32(cells.shape[1])
@@ -111,7 +112,7 @@ def _mark_row(y, t, nearness, ray, motion, flow, cells):  # type: ignore[no-unty
             cells[row, column] = max(cells[row, column], w / max(growth, least))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
     """Give uncovered pixels (0) the farther of their row's next surfaces, if there are any."""
     height, width = view.shape

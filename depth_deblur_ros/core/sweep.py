@@ -31,7 +31,8 @@ from depth_deblur_ros.core.lanes import (
     whole_blocks,
     WIDTH,
 )
-from numba import get_num_threads, njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import get_num_threads, njit
 import numpy as np
 import numpy.typing as npt
 
@@ -74,7 +75,7 @@ class Sweep:
     ) -> FloatImage:
         """Give weight (3, H, W') times A L of latent planes, in `out` if given."""
         blurred = np.empty_like(weight) if out is None else out
-        _gather(latent, weight, blurred, *self._parts())
+        on_threads(_gather, len(self.nearness), latent, weight, blurred, *self._parts())
         return blurred
 
     @cached_property
@@ -98,7 +99,7 @@ class Sweep:
 
     def scatter(self, blurred: FloatImage) -> FloatImage:
         """Spread blurred planes over `strips`; row j of strip k of n: latent row k H // n + j."""
-        _scatter(blurred, self.strips, *self._parts())
+        on_threads(_scatter, len(self.strips), blurred, self.strips, *self._parts())
         return self.strips
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
@@ -216,14 +217,14 @@ def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ig
         store(blurred, at + 2 * colour, share * load(weight, at + 2 * colour) * b)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _gather(latent, weight, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
+@njit(**SHARED)
+def _gather(first, end, latent, weight, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
     height, samples, width = nearness.shape
     sizes = (height, samples, width, latent.shape[1], latent.shape[2])
     data = (nearness.reshape(-1), flow.reshape(-1), shares.reshape(-1), cells.reshape(-1))
     flat = (latent.reshape(-1), weight.reshape(-1), blurred.reshape(-1))
-    for y in prange(height):
-        _gather_row(np.intp(y), *flat, data, far, room, sizes)
+    for y in range(first, end):
+        _gather_row(y, *flat, data, far, room, sizes)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -300,15 +301,15 @@ def _scatter_row(y, first, strip, blurred, data, far, room, sizes):  # type: ign
                 _spread_each(strip, p + 2 * plane, wide, places, b)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _scatter(blurred, strips, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
+@njit(**SHARED)
+def _scatter(first, end, blurred, strips, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
     height, samples, width = nearness.shape
     sizes = (height, samples, width, strips.shape[2], strips.shape[3])
     data = (nearness.reshape(-1), flow.reshape(-1), shares.reshape(-1), cells.reshape(-1))
     flat, count = blurred.reshape(-1), strips.shape[0]
-    for k in prange(count):
+    for k in range(first, end):
         strip = strips[k].reshape(-1)
         strip[:] = 0
-        first = np.int64(k) * height // count
-        for y in range(first, np.int64(k + 1) * height // count):
-            _scatter_row(y, first, strip, flat, data, far, room, sizes)
+        top = k * height // count
+        for y in range(top, (k + 1) * height // count):
+            _scatter_row(y, top, strip, flat, data, far, room, sizes)

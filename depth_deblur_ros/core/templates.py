@@ -17,7 +17,8 @@ from functools import lru_cache
 
 from depth_deblur_ros.core.data import FloatImage, Vector
 from depth_deblur_ros.core.lanes import load, splat, store, WIDTH
-from numba import njit, prange
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -128,7 +129,7 @@ def product(
     padded = np.zeros((-(-len(left) // 4) * 4, left.shape[1]), np.float32)
     padded[: len(left)] = left
     found = np.zeros((len(padded), len(blocks) * BLOCK), np.float32)
-    _multiply(padded, blocks.reshape(len(blocks), -1), wanted, found)
+    on_threads(_multiply, wanted.size, padded, blocks.reshape(len(blocks), -1), wanted, found)
     return found[: len(left)]
 
 
@@ -146,7 +147,7 @@ def blocks_around(flow: Vector, room: int) -> Blocks:
     return wanted
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _multiply_four(first, left, block, out):  # type: ignore[no-untyped-def]
     """Multiply four rows by a block (n * BLOCK,)."""
     a = a2 = b = b2 = c = c2 = d = d2 = splat(np.float32(0))
@@ -174,13 +175,13 @@ def _multiply_four(first, left, block, out):  # type: ignore[no-untyped-def]
     store(out, 3 * BLOCK + WIDTH, d2)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _multiply(left, blocks, wanted, found):  # type: ignore[no-untyped-def]
-    """Write left (4 m, n) times wanted blocks (k, n * BLOCK) into found (4 m, k * BLOCK)."""
-    for i in prange(wanted.size):
+@njit(**SHARED)
+def _multiply(first, end, left, blocks, wanted, found):  # type: ignore[no-untyped-def]
+    """Write left (4 m, n) times some wanted blocks (k, n * BLOCK) into found (4 m, k * BLOCK)."""
+    for i in range(first, end):
         k = wanted[i]
         out = np.empty(4 * BLOCK, np.float32)
-        for first in range(0, left.shape[0], 4):
-            _multiply_four(first, left, blocks[k], out)
+        for row in range(0, left.shape[0], 4):
+            _multiply_four(row, left, blocks[k], out)
             for j in range(4 * BLOCK):
-                found[first + j // BLOCK, k * BLOCK + j % BLOCK] = out[j]
+                found[row + j // BLOCK, k * BLOCK + j % BLOCK] = out[j]
