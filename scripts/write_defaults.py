@@ -48,7 +48,11 @@ MODES = {  # the motion, the image, what for
         'fewer rounds: softer where the blur is long',
         'live',
     ),
-    'motion': ('found', 'left as it is', 'odometry: costs the search alone'),
+    'motion': (
+        'found; that of the first frame refined a little',
+        'left as it is',
+        'odometry: from the second frame on it costs the search alone',
+    ),
 }
 TUM = {
     'colour_topic': '/camera/rgb/image_color',

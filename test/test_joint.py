@@ -7,10 +7,12 @@ import sys
 
 from depth_deblur_ros.core import joint
 from depth_deblur_ros.core.blur import blur_operator
-from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
+from depth_deblur_ros.core.data import CameraIntrinsics, InputError, Motion, Outcome
 from depth_deblur_ros.core.geometry import blur_length
-from depth_deblur_ros.core.joint import refine
+from depth_deblur_ros.core.joint import Effort, refine
+from depth_deblur_ros.core.likelihood import Pace
 from depth_deblur_ros.core.pyramid import Level
+from depth_deblur_ros.core.solver import BRIEF
 from depth_deblur_ros.core.start import motion_axes, Start
 import numpy as np
 from pictures import texture
@@ -19,7 +21,7 @@ import pytest
 CAMERA = CameraIntrinsics(180.0, 180.0, 111.5, 79.5, 224, 160, transfer='linear')
 DEPTH = np.float32(1.5 + np.indices((160, 224))[1] / 224)
 TRUTH = np.array([0.01, 0.05, 0.02, 0, 0, 0])
-BUDGET = 80_000
+EFFORT = Effort(80_000)
 
 
 def blurred(truth, sigma=0.004):
@@ -43,25 +45,38 @@ def off(p, truth=TRUTH):
 
 
 @pytest.mark.parametrize('factor', [0.9, 1.1])
-def test_a_start_that_is_too_short_or_too_long_comes_nearer(factor):
-    found = refine(blurred(TRUTH), DEPTH, CAMERA, start(factor * TRUTH), BUDGET)
-    assert off(found.vector) < 0.4 * off(factor * TRUTH)
+@pytest.mark.parametrize(('effort', 'left'), [(EFFORT, 0.4), (BRIEF, 0.5)])
+def test_a_start_that_is_too_short_or_too_long_comes_nearer(factor, effort, left):
+    found = refine(blurred(TRUTH), DEPTH, CAMERA, start(factor * TRUTH), effort)
+    assert off(found.vector) < left * off(factor * TRUTH)
+
+
+@pytest.mark.parametrize('wrong', [{'pixels': 0}, {'moves': 0}, {'readable': 0.0}])
+def test_an_effort_that_is_none_is_refused(wrong):
+    with pytest.raises(InputError, match='not Effort'):
+        Effort(**{'pixels': 80_000, **wrong})
+
+
+def test_a_pace_that_leads_nowhere_is_refused():
+    for wrong in ({'spacing': 0.0}, {'spacing': np.nan}, {'steps': 0}):
+        with pytest.raises(InputError, match='not Pace'):
+            Pace(**wrong)
 
 
 def test_the_truth_stays():
-    found = refine(blurred(TRUTH), DEPTH, CAMERA, start(TRUTH), BUDGET)
+    found = refine(blurred(TRUTH), DEPTH, CAMERA, start(TRUTH), EFFORT)
     assert off(found.vector) < 0.2
 
 
 def test_a_plain_wall_leaves_the_start():
     plain = np.full(DEPTH.shape, 0.5, np.float32)
-    found = refine(plain, DEPTH, CAMERA, start(TRUTH), BUDGET)
+    found = refine(plain, DEPTH, CAMERA, start(TRUTH), EFFORT)
     assert off(found.vector) < 0.01
 
 
 def test_an_image_that_tells_something_narrows_the_covariance():
     begun = start(TRUTH)
-    found = refine(blurred(TRUTH), DEPTH, CAMERA, begun, BUDGET)
+    found = refine(blurred(TRUTH), DEPTH, CAMERA, begun, EFFORT)
     axes = np.linalg.inv(motion_axes(DEPTH, CAMERA)[:6, :6])
     sd = np.sqrt(np.diag(axes @ found.covariance @ axes.T))
     assert (sd <= 0.7 + 1e-9).all()
@@ -69,9 +84,8 @@ def test_an_image_that_tells_something_narrows_the_covariance():
 
 
 def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
-    monkeypatch.setattr(joint, 'READABLE', 5.0)
     monkeypatch.setattr(joint, 'LEAST_SIDE', 40)
-    parts = joint._parts(Level(blurred(TRUTH), DEPTH, CAMERA), 9.0, BUDGET)
+    parts = joint._parts(Level(blurred(TRUTH), DEPTH, CAMERA), 9.0, Effort(80_000, readable=5.0))
     assert {part.light.shape for part in parts} == {(40, 56)}
     fx = {part.camera.fx for part in parts}
     assert fx == {CAMERA.fx / 2}
@@ -80,7 +94,7 @@ def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
 def test_parts_lie_where_the_picture_is_busy():
     light = np.full(DEPTH.shape, 0.5, np.float32)
     light[10:40, 60:100] += texture(0, (30, 40)) - 0.5
-    part = joint._parts(Level(light, DEPTH, CAMERA), 5.0, 160 * 224 // 4)[0]
+    part = joint._parts(Level(light, DEPTH, CAMERA), 5.0, Effort(160 * 224 // 4))[0]
     assert part.light.std() > 0
     assert np.ptp(part.light) == pytest.approx(np.ptp(light), rel=1e-6)
 
@@ -88,7 +102,7 @@ def test_parts_lie_where_the_picture_is_busy():
 def test_the_camera_of_a_part_sees_what_the_frame_sees():
     """A ray through a part's pixel is the ray through the same pixel of the frame."""
     light = blurred(TRUTH)
-    for part in joint._parts(Level(light, DEPTH, CAMERA), 5.0, 160 * 224 // 4):
+    for part in joint._parts(Level(light, DEPTH, CAMERA), 5.0, Effort(160 * 224 // 4)):
         left, top = CAMERA.cx - part.camera.cx, CAMERA.cy - part.camera.cy
         assert left == round(left) and top == round(top)
         rows, columns = part.light.shape
@@ -123,7 +137,7 @@ def test_the_curvature_follows_a_quadratic():
 def test_the_parts_are_refined_where_numba_has_no_openmp():
     code = (
         'import numba, test_joint as t; found = t.refine(t.blurred(t.TRUTH), t.DEPTH, t.CAMERA, '
-        't.start(0.9 * t.TRUTH), 80_000); print(numba.threading_layer(), t.off(found.vector))'
+        't.start(0.9 * t.TRUTH), t.EFFORT); print(numba.threading_layer(), t.off(found.vector))'
     )
     plainest = {**os.environ, 'NUMBA_THREADING_LAYER': 'workqueue'}
     done = subprocess.run(

@@ -14,14 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
 import math
 from typing import TypeVar
 
-from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vector
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion, Vector
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
-from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+from depth_deblur_ros.core.likelihood import curvature_of, Pace, Part, posterior, settled, slope_of
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.start import Start
 from numba import (  # type: ignore[attr-defined]
@@ -33,11 +34,9 @@ import numpy as np
 
 Result = TypeVar('Result')
 
-READABLE = 50.0  # px; longer blurs are refined at half the size, or less
-AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
+AFFORDABLE = 20.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
-MOVES = 4
 LONGEST_MOVE, LEAST_MOVE = 1.0, 0.1  # px
 # What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
 # by a curve follows sRGB's only about, and the parts share what that gets wrong.
@@ -46,51 +45,73 @@ DISSENT = {'linear': 10.0, 'srgb': 40.0}
 BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 
 
+@dataclass(frozen=True)
+class Effort:
+    """What a refinement may cost: px that are looked at, moves, the pace of each look."""
+
+    pixels: int
+    moves: int = 4
+    readable: float = 50.0  # px; longer blurs are refined at half the size, or less
+    pace: Pace = field(default_factory=Pace)
+
+    def __post_init__(self) -> None:
+        if self.pixels < 1 or self.moves < 1 or not self.readable > 0:
+            raise InputError(f'pixels and moves must be >= 1, readable > 0, not {self}')
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """What holds against the likelihood: the start (9,), its certainty (9, 9), and dissent."""
+
+    start: Vector
+    certainty: Vector
+    dissent: float
+
+
 def refine(
     light: FloatImage,
     depth: FloatImage,
     camera: CameraIntrinsics,
     start: Start,
-    budget: int,
+    effort: Effort,
 ) -> Motion:
     """
     Give the motion, with its covariance, that makes blurred grey light (H, W) likeliest.
 
-    depth (H, W) filled [m]; start: what the spectra tell, whose covariance takes part;
-    budget: px that are looked at.
+    depth (H, W) filled [m]; start: what the spectra tell, whose covariance takes part.
     """
 
     def length(p: Vector) -> float:
         return blur_length(p, depth, camera)
 
     p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
-    parts = _parts(Level(light, depth, camera), length(p), budget)
+    parts = _parts(Level(light, depth, camera), length(p), effort)
     begun = _each(lambda part: _begun(part, p), parts)
-    return _moved(begun, p, certainty, length, DISSENT[camera.transfer])
+    pull = Pull(p, certainty, DISSENT[camera.transfer])
+    return _moved(begun, pull, length, effort.moves)
 
 
 def _moved(
     begun: list[tuple[Part, Vector, Vector]],
-    start: Vector,
-    certainty: Vector,
+    pull: Pull,
     length: Callable[[Vector], float],
-    dissent: float,
+    moves: int,
 ) -> Motion:
     """Go where the slope of the likelihood and the pull of the start balance."""
     parts, slopes, curvatures = zip(*begun, strict=True)
-    bends, gs, p = np.array(curvatures), np.array(slopes), start
+    bends, gs, p = np.array(curvatures), np.array(slopes), pull.start
     bend = bends.sum(0)
-    for k in range(MOVES):
-        soft = _softening(gs, bends, dissent)
-        force = gs.sum(0) / soft + certainty @ (p - start)
-        move = -np.linalg.solve(bend / soft + certainty, force)
+    for k in range(moves):
+        soft = _softening(gs, bends, pull.dissent)
+        force = gs.sum(0) / soft + pull.certainty @ (p - pull.start)
+        move = -np.linalg.solve(bend / soft + pull.certainty, force)
         move *= min(1.0, LONGEST_MOVE / max(length(move), 1e-9))
         p = p + move
-        if length(move) < LEAST_MOVE or k == MOVES - 1:
+        if length(move) < LEAST_MOVE or k == moves - 1:
             break
         last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
-    return Motion.from_vector(p, np.linalg.inv(bend / soft + certainty)[:6, :6])
+    return Motion.from_vector(p, np.linalg.inv(bend / soft + pull.certainty)[:6, :6])
 
 
 def _slope(part: Part, p: Vector) -> Vector:
@@ -139,16 +160,16 @@ def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
     return np.asarray(half * np.clip(values, *BENDS) @ half.T)
 
 
-def _parts(level: Level, length: float, budget: int) -> list[Part]:
-    """Choose one part of each quarter, the most textured, at a size where the blur is READABLE."""
+def _parts(level: Level, length: float, effort: Effort) -> list[Part]:
+    """Choose one part of each quarter, the most textured, at a size where the blur is readable."""
     factor, least = 1, min(level.image.shape)
-    while length > READABLE * factor and least >= 4 * LEAST_SIDE * factor:
+    while length > effort.readable * factor and least >= 4 * LEAST_SIDE * factor:
         factor *= 2
     if factor > 1:
         level = scaled_level(level, level.camera.width // factor, level.camera.height // factor)
     light, depth, camera = level.image, level.depth, level.camera
     height, width = (side // 2 for side in light.shape)
-    pixels = budget * min(1.0, AFFORDABLE * factor / length)
+    pixels = effort.pixels * min(1.0, AFFORDABLE * factor / length)
     share = min(1.0, math.sqrt(pixels / light.size))
     rows, columns = int(height * share), int(width * share)
     parts = []
@@ -160,7 +181,7 @@ def _parts(level: Level, length: float, budget: int) -> list[Part]:
         cut = camera.cropped(left + x, top + y, columns, rows)
         own = np.ascontiguousarray(light[box])
         counts = (stored_from_light(own, camera.transfer) < SATURATED).astype(np.float32)
-        parts.append(Part(own, counts, np.ascontiguousarray(depth[box]), cut, k))
+        parts.append(Part(own, counts, np.ascontiguousarray(depth[box]), cut, k, pace=effort.pace))
     return parts
 
 

@@ -24,16 +24,16 @@ from functools import cached_property, lru_cache
 import math
 
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
-from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Vector
+from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion, Vector
 from depth_deblur_ros.core.light import light_slope, stored_from_light
 from depth_deblur_ros.core.motion import blur_and_slope
 from depth_deblur_ros.core.quadratic import conjugate_gradients, Quadratic, reweighted
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 
-REWEIGHTINGS, STEPS = 4, 10  # of the image step
-# In the last of them: what so few steps leave undone changes its sign from one to the next, and
-# the motion with it.
+REWEIGHTINGS = 4  # of the image step
+# Conjugate gradient steps in the last of them: what so few steps leave undone changes its sign
+# from one to the next, and the motion with it.
 LAST_STEPS = 15
 PRIORS = (0.2, 60.0)  # where its weight stays
 DOUBTED = 3.0  # sigma; what is missed by as much counts half
@@ -55,6 +55,18 @@ class Scales:
     prior: float = 2.7
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How finely the image step works: px from instant to instant, steps of a reweighting."""
+
+    spacing: float = 1.0  # of the longest blur
+    steps: int = 10  # conjugate gradients; the last reweighting has LAST_STEPS
+
+    def __post_init__(self) -> None:
+        if not self.spacing > 0 or self.steps < 1:
+            raise InputError(f'spacing must be > 0 and steps >= 1, not {self}')
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """A part of the frame: grey light and depth [m] (H, W), what counts of it, its own camera."""
@@ -65,6 +77,7 @@ class Part:
     camera: CameraIntrinsics
     seed: int  # of its noise, which stays the same while the motion changes
     scales: Scales = Scales()
+    pace: Pace = Pace()
 
     @cached_property
     def slope(self) -> FloatImage:
@@ -100,7 +113,8 @@ def posterior(part: Part, p: Vector) -> Posterior:
 
 def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
     """Run the image step on three planes: the image, and two of noise alone."""
-    blur = blur_operator(Motion.from_vector(p), part.depth, part.camera)
+    pace = part.pace
+    blur = blur_operator(Motion.from_vector(p), part.depth, part.camera, pace.spacing)
     sweep, transfer = blur.sweep, part.camera.transfer
     within = sweep.blurred_planes(np.ones((*part.light.shape, 3), np.float32))
     latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
@@ -112,7 +126,7 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
         problem = reweighted(stored, sweep, transfer, trust, weight)
         push = problem.slope(data - sweep.gather(latent, within), latent)
         push[1:] += sigma * _prior_noise(problem, part.seed)
-        latent = conjugate_gradients(problem, latent, push, STEPS if k else LAST_STEPS)
+        latent = conjugate_gradients(problem, latent, push, pace.steps if k else LAST_STEPS)
         if follow and k:
             missing = data - sweep.gather(latent, within)
             missing[1:] -= data[1:]
@@ -227,15 +241,18 @@ def _flat(rows: FloatImage) -> FloatImage:
 
 def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
     """Give <J, W (J - A z)> / sigma^2 (9, 9), z how mu answers to a change of p [K75], (17)."""
-    sweep, width = found.blur.sweep, slope.shape[1]
+    sweep, width, steps = found.blur.sweep, slope.shape[1], found.part.pace.steps
     rest = np.empty_like(slope)
-    for first in (0, 3, 6):
+    for first in (0, 3):
         some = slice(first, first + 3)
         columns = sweep.blurred_planes(slope[..., some])
         push = sweep.adjoint(found.problem.trust * columns)
-        z = conjugate_gradients(found.problem, np.zeros_like(push), push, STEPS)
+        z = conjugate_gradients(found.problem, np.zeros_like(push), push, steps)
         answered = columns - sweep.gather(z, np.ones_like(columns))
         rest[..., some] = np.moveaxis(answered, 0, 2)[:, :width]
+    # Over the length of a blur yn hardly changes: what it weighs is answered alike.
+    yn = found.blur.ray[-len(rest) :, None, None]
+    rest[..., 6:] = yn * rest[..., :3]
     weighted = found.part.trust[..., None] * slope
     h = np.einsum('ni,nj->ij', weighted.reshape(-1, 9), rest.reshape(-1, 9), dtype=np.float64)
     return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2

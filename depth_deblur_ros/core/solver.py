@@ -5,7 +5,7 @@ The page that tells the algorithm: from one blurred RGB-D frame to the sharp ima
 2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or
   find that there is no blur or nothing to trust: then the frame passes unchanged
 3 move on to where the image itself is likeliest (joint.py): in mode full, and at the first frame
-  in mode fast
+  in the others
 4 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
 
 With `method` paper, 2 to 4 are the paper's: alternation.py.
@@ -29,10 +29,11 @@ from depth_deblur_ros.core.data import (
 )
 from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
-from depth_deblur_ros.core.joint import refine
+from depth_deblur_ros.core.joint import Effort, refine
 from depth_deblur_ros.core.latent import LatentSteps, restore_coarse_to_fine
 from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.light import as_colour, light_from_stored, stored_from_light
+from depth_deblur_ros.core.likelihood import Pace
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
 from depth_deblur_ros.core.trust import calibrated, OF_LIKELIHOOD, OF_SPECTRA
@@ -42,7 +43,10 @@ import numpy as np
 SATURATED, EVENLY = 0.98, 0.02  # stored values; how many more pixels a channel may have there
 SPARSE = 4  # every so many-th pixel tells that
 FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
-FULL_BUDGET, FAST_BUDGET = 200_000, 80_000  # px that the joint refinement looks at
+# Of the joint refinement. What few pixels tell is blurred by noise, so they are read more finely,
+# and solved less far.
+FULL, FAST = Effort(200_000), Effort(80_000)
+BRIEF = Effort(50_000, moves=2, readable=24.0, pace=Pace(spacing=0.7, steps=5))
 
 
 def deblur(
@@ -67,25 +71,27 @@ def deblur(
         grey = _grey(frame.image, _shares(frame.image))
         found = blind_start(grey, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
-            budget = _budget(params.mode, known=start is not None)
-            found = replace(found, motion=_settled(frame, depth, found, budget))
+            effort = _effort(params.mode, known=start is not None)
+            found = replace(found, motion=_settled(frame, depth, found, effort))
         return _finish(frame, depth, found, params, began)
 
 
-def _budget(mode: str, *, known: bool) -> int:
-    """Say how many pixels the joint refinement looks at; known: what about to expect."""
+def _effort(mode: str, *, known: bool) -> Effort | None:
+    """Say what the joint refinement may cost, if there is one; known: what about to expect."""
     if mode == 'full':
-        return FULL_BUDGET
-    return FAST_BUDGET if mode == 'fast' and not known else 0
+        return FULL
+    if known:
+        return None
+    return FAST if mode == 'fast' else BRIEF
 
 
-def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, budget: int) -> Motion:
-    """Refine the motion, if there is a budget, and tell a covariance as large as errors are."""
-    if not budget:
+def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort | None) -> Motion:
+    """Refine the motion, if it may cost that, and tell a covariance as large as errors are."""
+    if effort is None:
         return calibrated(found.motion, found.axes, OF_SPECTRA * found.doubt)
     light = light_from_stored(frame.image, frame.camera.transfer)
     light = _grey(light, _shares(frame.image))
-    motion = refine(light, depth, frame.camera, found, budget)
+    motion = refine(light, depth, frame.camera, found, effort)
     return calibrated(motion, found.axes, OF_LIKELIHOOD[frame.camera.transfer] * found.doubt)
 
 
