@@ -37,7 +37,7 @@ Result = TypeVar('Result')
 AFFORDABLE = 20.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
-LONGEST_MOVE, LEAST_MOVE = 1.0, 0.1  # px
+LONGEST_MOVE = 1.0  # px
 # What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
 # by a curve follows sRGB's only about, and the parts share what that gets wrong.
 SOFTEST = 10.0
@@ -52,6 +52,7 @@ class Effort:
     pixels: int
     moves: int = 4
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
+    enough: float = 0.1  # px; the first move that is shorter is the last
     pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
@@ -88,26 +89,26 @@ def refine(
     parts = _parts(Level(light, depth, camera), length(p), effort)
     begun = _each(lambda part: _begun(part, p), parts)
     pull = Pull(p, certainty, DISSENT[camera.transfer])
-    return _moved(begun, pull, length, effort.moves)
+    return _moved(begun, pull, length, effort)
 
 
 def _moved(
     begun: list[tuple[Part, Vector, Vector]],
     pull: Pull,
     length: Callable[[Vector], float],
-    moves: int,
+    effort: Effort,
 ) -> Motion:
     """Go where the slope of the likelihood and the pull of the start balance."""
     parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), pull.start
     bend = bends.sum(0)
-    for k in range(moves):
+    for k in range(effort.moves):
         soft = _softening(gs, bends, pull.dissent)
         force = gs.sum(0) / soft + pull.certainty @ (p - pull.start)
         move = -np.linalg.solve(bend / soft + pull.certainty, force)
         move *= min(1.0, LONGEST_MOVE / max(length(move), 1e-9))
         p = p + move
-        if length(move) < LEAST_MOVE or k == moves - 1:
+        if length(move) < effort.enough or k == effort.moves - 1:
             break
         last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)

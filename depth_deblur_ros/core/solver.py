@@ -46,7 +46,7 @@ FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer
 # Of the joint refinement. What few pixels tell is blurred by noise, so they are read more finely,
 # and solved less far.
 FULL, FAST = Effort(200_000), Effort(80_000)
-BRIEF = Effort(50_000, moves=2, readable=24.0, pace=Pace(spacing=0.7, steps=5))
+BRIEF = Effort(50_000, moves=2, readable=24.0, enough=0.2, pace=Pace(spacing=0.7, steps=5))
 
 
 def deblur(
