@@ -206,3 +206,19 @@ def test_a_blur_beyond_the_full_scale_is_not_taken_for_half_of_it(length):
         for s in (1, -1)
     ]
     assert min(apart) < 0.05 * length
+
+
+@pytest.mark.parametrize('length', [50, 60])
+def test_a_blur_too_long_for_a_small_picture_is_not_told_as_a_shorter_one(length):
+    frame, _ = blurred_frame(320, 240, length)
+    grey = frame.image.mean(2)
+    assert blind_start(grey, frame.depth, frame.camera).outcome is Outcome.FAILED
+
+
+def test_a_motion_that_one_more_scale_sees_otherwise_is_not_told(monkeypatch):
+    picture = swept(texture(1), 20, 0.7, 0.005)
+    assert blind_start(picture, DEPTH, CAMERA).outcome is Outcome.SOLVED
+    monkeypatch.setattr(start, '_refuted', lambda *_: True)
+    assert blind_start(picture, DEPTH, CAMERA).outcome is Outcome.FAILED
+    near = sideways(20.5, 0.7)
+    assert blind_start(picture, DEPTH, CAMERA, near).outcome is Outcome.SOLVED  # known before

@@ -13,6 +13,7 @@ Notation: q (6,) or (9,), with turns that rows see differently, motion in pixels
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -23,12 +24,14 @@ from depth_deblur_ros.core.templates import PATCH, REACH
 import numpy as np
 
 SCALES = (1, 2, 4)
+WITNESS = 1.75  # the scale of a small picture, whose half holds too few patches; has no vote
 CLOSE = 0.5  # the scale at twice the size
 SHARE = {
     CLOSE: 1.0,
     1: 1.0,
     2: 0.5,
     4: 0.25,
+    WITNESS: 0.7,
 }  # of a scale in the common score: coarse bands are deep but inexact
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
 ROLLING_COST = 0.07  # of S per squared change from first to last row over the squared length
@@ -61,7 +64,7 @@ class Scale:
     evidence: Evidence
 
 
-def find(spectra: dict[int, Spectra], guess: Vector | None) -> tuple[Vector, list[Scale]]:
+def find(spectra: Mapping[float, Spectra], guess: Vector | None) -> tuple[Vector, list[Scale]]:
     """Let each scale propose and all choose; q (9,), and what the scales say of all motions."""
     scales = _scales(spectra)
     return _search(scales, guess), scales
@@ -81,7 +84,7 @@ def ask_twice(q: Vector, scales: list[Scale]) -> tuple[Vector, list[Scale]]:
     return (twice, coarse) if other < DEEPER * one else (q, scales)
 
 
-def find_near(spectra: dict[int, Spectra], guess: Vector) -> tuple[Vector, list[Scale]]:
+def find_near(spectra: Mapping[float, Spectra], guess: Vector) -> tuple[Vector, list[Scale]]:
     """Find q (9,) around a guess (9,), and what the scales say of the motions there."""
     scales = _scales(spectra, guess)
     return _settled(guess, scales, NEAR), scales
@@ -104,10 +107,10 @@ def find_short(scale: Scale, spectra: Spectra, near: Vector | None) -> tuple[Vec
 
 def look(
     grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
-) -> dict[int, Spectra]:
+) -> dict[float, Spectra]:
     """Look at each scale that holds enough patches, at the full one always, by its factor."""
     whole = _whole(grey)
-    found: dict[int, Spectra] = {}
+    found: dict[float, Spectra] = {}
     for factor in SCALES:
         width, height = camera.width // factor, camera.height // factor
         if min(width, height) < PATCH:
@@ -117,6 +120,18 @@ def look(
             break
         found[factor] = spectra
     return found
+
+
+def look_again(
+    grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+) -> dict[float, Spectra]:
+    """Look at the scale of the witness, if it holds enough patches."""
+    width, height = int(camera.width / WITNESS), int(camera.height / WITNESS)
+    if min(width, height) < PATCH:
+        return {}
+    images = (grey, _whole(grey), depth)
+    spectra = _seen(images, camera.scaled(width, height), axes, cv2.INTER_AREA)
+    return {WITNESS: spectra} if len(spectra.weight) >= FEW else {}
 
 
 def close_up(
@@ -149,12 +164,12 @@ def _seen(
     return gather_spectra(grey, whole, depth, camera, axes)
 
 
-def _scales(spectra: dict[int, Spectra], near: Vector | None = None) -> list[Scale]:
+def _scales(spectra: Mapping[float, Spectra], near: Vector | None = None) -> list[Scale]:
     """Gather the evidence of each scale, of all motions or of those near one."""
     if near is None:
         return [Scale(factor, own.evidence()) for factor, own in spectra.items()]
     return [
-        Scale(factor, own.evidence_around(near, ROOM // factor + 2))
+        Scale(factor, own.evidence_around(near, int(ROOM // factor) + 2))
         for factor, own in spectra.items()
     ]
 

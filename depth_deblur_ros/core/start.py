@@ -10,7 +10,7 @@ blur [px].
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 import math
 
@@ -26,6 +26,7 @@ from depth_deblur_ros.core.search import (
     find_near,
     find_short,
     look,
+    look_again,
     Scale,
     SHARE,
     slope_and_bend,
@@ -45,6 +46,7 @@ CLOSE_BIAS = 1.0  # px; close up, blurs seem longer: the root of both squares
 LONG_TRUST = 0.2  # least common -S of a long blur
 # Where the full scale is the only one; shorter blurs leave deeper bands than long ones.
 ALONE_TRUST, ALONE_SHORT, ALONE_SHORT_TRUST = 0.15, 16.0, 0.175
+WITNESSED, APART = 12.0, 0.12  # px; such motions are asked for again; share of the length
 DOUBT = 1.3  # times that where the picture looks sharp
 CLEARLY_SHARP, RATHER_SHARP = (
     1.15,
@@ -106,6 +108,9 @@ def blind_start(
     first = np.asarray(np.linalg.solve(axes, guess.by_rows)) if guess else None
     q, scales = _found(spectra, first, length, edges)
     trusted = _trusted(q, length(q), scales, edges)
+    alone = trusted and len(spectra) == 1 and guess is None and length(q) > WITNESSED
+    if alone and _refuted(q, spectra | look_again(grey, depth, camera, axes), length, edges):
+        return _nothing(Outcome.FAILED, axes)
     look_closer = length(q) < CLOSE_BELOW if trusted else edges.along > EDGED
     if look_closer and scales[0].factor == 1:
         close = close_up(grey, depth, camera, axes)
@@ -126,7 +131,7 @@ def blind_start(
 
 
 def _found(
-    spectra: dict[int, Spectra],
+    spectra: Mapping[float, Spectra],
     first: Vector | None,
     length: Callable[[Vector], float],
     edges: Edges,
@@ -138,6 +143,17 @@ def _found(
             return q, scales
     q, scales = find(spectra, first)
     return ask_twice(q, scales) if length(q) > HALVED else (q, scales)
+
+
+def _refuted(
+    q: Vector,
+    spectra: Mapping[float, Spectra],
+    length: Callable[[Vector], float],
+    edges: Edges,
+) -> bool:
+    """Tell whether one more scale, searched together with the others, finds another motion."""
+    other, _ = _found(spectra, None, length, edges)
+    return min(length(q - other), length(q + other)) > APART * length(q)
 
 
 def _trusted(q: Vector, length: float, scales: list[Scale], edges: Edges) -> bool:
