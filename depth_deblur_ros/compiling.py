@@ -24,7 +24,7 @@ class _Teller(event.Listener):
         if self._say and kernel.py_func.__module__.startswith(__package__):
             say, self._say = self._say, None
             say(
-                'compiling kernels, half a minute or more; the next run finds them in '
+                'compiling kernels, up to half a minute; the next run finds them in '
                 f'{kernel.stats.cache_path or "no cache, and compiles them again"}'
             )
 

@@ -34,7 +34,7 @@ import numpy as np
 
 Result = TypeVar('Result')
 
-AFFORDABLE = 20.0  # px; of longer blurs, fewer pixels are looked at
+AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 LONGEST_MOVE = 1.0  # px
@@ -53,11 +53,12 @@ class Effort:
     moves: int = 4
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
     enough: float = 0.1  # px; the first move that is shorter is the last
+    doubt: float = 1.0  # times as large is the covariance as that of a refinement to the end
     pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
-        if self.pixels < 1 or self.moves < 1 or not self.readable > 0:
-            raise InputError(f'pixels and moves must be >= 1, readable > 0, not {self}')
+        if self.pixels < 1 or self.moves < 1 or not (self.readable > 0 and self.doubt > 0):
+            raise InputError(f'pixels, moves must be >= 1, readable and doubt > 0, not {self}')
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,8 @@ FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer
 # Of the joint refinement. What few pixels tell is blurred by noise, so they are read more finely,
 # and solved less far.
 FULL, FAST = Effort(200_000), Effort(80_000)
-BRIEF = Effort(50_000, moves=2, readable=24.0, enough=0.2, pace=Pace(spacing=0.7, steps=5))
+PACE = Pace(spacing=0.7, steps=5)
+BRIEF = Effort(32_000, moves=2, readable=24.0, enough=0.2, doubt=1.35, pace=PACE)
 
 
 def deblur(
@@ -92,7 +93,8 @@ def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort |
     light = light_from_stored(frame.image, frame.camera.transfer)
     light = _grey(light, _shares(frame.image))
     motion = refine(light, depth, frame.camera, found, effort)
-    return calibrated(motion, found.axes, OF_LIKELIHOOD[frame.camera.transfer] * found.doubt)
+    share = OF_LIKELIHOOD[frame.camera.transfer] * effort.doubt
+    return calibrated(motion, found.axes, share * found.doubt)
 
 
 def restore_known(
