@@ -42,6 +42,7 @@ from depth_deblur_ros.core.templates import (
     REACH,
     template_table,
 )
+from depth_deblur_ros.core.threads import on_threads
 from numba import njit, prange
 import numpy as np
 import numpy.typing as npt
@@ -127,9 +128,10 @@ def _spectra(
     weight = np.zeros(len(corners), np.float32)
     places = bins // HALF * BAND_COLUMNS + bins % HALF
     ys, xs = np.array(corners).T
-    for difference in _differences(grey):
-        field = difference * valid
-        for x in np.unique(xs):
+    fields, columns = [difference * valid for difference in _differences(grey)], np.unique(xs)
+
+    def add(first: int, end: int) -> None:
+        for x, field in ((x, field) for x in columns[first:end] for field in fields):
             strip = window * field[:, x : x + PATCH]
             square = np.square(strip).sum(1)
             rows = np.fft.rfft(strip, axis=1)[:, :BAND_COLUMNS]
@@ -138,6 +140,8 @@ def _spectra(
             found = np.fft.fft(cut, axis=1).reshape(len(own), -1)[:, places]
             power[own] += found.real**2 + found.imag**2
             weight[own] += [(window**2 * square[y : y + PATCH]).sum() for y in ys[own]]
+
+    on_threads(add, len(columns))
     return power, weight / np.float32(PATCH**2)
 
 

@@ -15,6 +15,7 @@ import math
 
 import cv2
 from depth_deblur_ros.core.data import FloatImage, Motion, Vector
+from depth_deblur_ros.core.threads import on_threads
 import numpy as np
 import numpy.typing as npt
 
@@ -64,15 +65,19 @@ def sharpness(grey: FloatImage) -> tuple[float, float]:
     """
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.6), np.float32)
     step = max(1, math.isqrt(grey.size // ENOUGH))
-    ratios = []
-    for k in range(DIRECTIONS):
-        angle = math.pi * k / DIRECTIONS
-        near = _difference(smooth, angle, 1.0, step)
-        far = _difference(smooth, angle, FURTHER, step) / np.float32(FURTHER)
-        steep = np.abs(near)
-        strong = steep >= np.percentile(steep, 90)
-        ratios.append(float(_rms(near[strong]) / max(_rms(far[strong]), 1e-9)))
-    return min(ratios), max(ratios)
+    ratios = np.empty(DIRECTIONS)
+
+    def look(first: int, end: int) -> None:
+        for k in range(first, end):
+            angle = math.pi * k / DIRECTIONS
+            near = _difference(smooth, angle, 1.0, step)
+            far = _difference(smooth, angle, FURTHER, step) / np.float32(FURTHER)
+            steep = np.abs(near)
+            strong = steep >= np.percentile(steep, 90)
+            ratios[k] = _rms(near[strong]) / max(_rms(far[strong]), 1e-9)
+
+    on_threads(look, DIRECTIONS)
+    return float(ratios.min()), float(ratios.max())
 
 
 def _difference(image: FloatImage, angle: float, length: float, step: int) -> FloatImage:
