@@ -69,7 +69,7 @@ def deblur(
             found, energies = _alternated(frame, depth, params)
             result = _finish(frame, depth, found, params, began)
             return replace(result, energies=energies)
-        grey = _grey(frame.image, _shares(frame.image))
+        grey = _grey(frame.image, _channels(frame.image))
         found = blind_start(grey, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
             effort = _effort(params.mode, known=start is not None)
@@ -91,7 +91,7 @@ def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort |
     if effort is None:
         return calibrated(found.motion, found.axes, OF_SPECTRA * found.doubt)
     light = light_from_stored(frame.image, frame.camera.transfer)
-    light = _grey(light, _shares(frame.image))
+    light = _grey(light, _channels(frame.image))
     motion = refine(light, depth, frame.camera, found, effort)
     share = OF_LIKELIHOOD[frame.camera.transfer] * effort.doubt
     return calibrated(motion, found.axes, share * found.doubt)
@@ -156,19 +156,20 @@ def _alternated(
     return Start(Motion.from_vector(found.p), found.outcome, found.quality), found.trace
 
 
-def _grey(image: FloatImage, shares: FloatImage) -> FloatImage:
+def _grey(image: FloatImage, channels: FloatImage) -> FloatImage:
     if image.ndim == 2:
         return image
-    return np.asarray(cv2.transform(image, shares), np.float32)
+    # Divided last, so that the mean of three equal values is that value, to the bit.
+    return np.asarray(cv2.transform(image, channels) / channels.sum(), np.float32)
 
 
-def _shares(image: FloatImage) -> FloatImage:
-    """Give the channels' shares of grey (1, 3): a mean of burnt and other channels is no light."""
+def _channels(image: FloatImage) -> FloatImage:
+    """Give which channels (1, 3) make grey, 1 or 0: a mean of burnt and others is no light."""
     if image.ndim == 2:
         return np.ones((1, 1), np.float32)
     burnt = (image[::SPARSE, ::SPARSE] > SATURATED).mean((0, 1))
     chosen = burnt <= burnt.min() + EVENLY
-    return np.asarray(chosen[None] / chosen.sum(), np.float32)
+    return np.asarray(chosen[None], np.float32)
 
 
 @contextmanager
