@@ -16,6 +16,7 @@ rows may see different turns.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import itertools
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
@@ -131,7 +132,7 @@ def _spectra(
     fields, columns = [difference * valid for difference in _differences(grey)], np.unique(xs)
 
     def add(first: int, end: int) -> None:
-        for x, field in ((x, field) for x in columns[first:end] for field in fields):
+        for x, field in itertools.product(columns[first:end], fields):
             strip = window * field[:, x : x + PATCH]
             square = np.square(strip).sum(1)
             rows = np.fft.rfft(strip, axis=1)[:, :BAND_COLUMNS]
