@@ -1,19 +1,29 @@
 """
-A kernel's work on several threads.
+Work on several threads: a kernel, or a function that lets numpy work.
 
-Kernels run without the interpreter's lock, each on a share of the work. numba could do so by
-itself, but compiles what runs side by side four times over, which takes most of a first run.
+Kernels run without the interpreter's lock, each thread on a share of the work. numba could do so
+by itself, but compiles what runs side by side four times over, which takes most of a first run.
+
+To wake a thread takes longer than many a share. So a worker stays awake for a moment after each,
+and what it has not begun when the caller is through, the caller has done itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import partial
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Any
 
-from numba import config, get_num_threads
+from numba import get_num_threads, njit, types
 from numba.core.compiler import Compiler
+import numpy as np
+
+ASKED, DONE = 0, 1  # places in a worker's turns: shares that it was given, that it did
+PATIENCE = 400  # looks at the turns, about half a microsecond each, before it sleeps
+HEAD_START = 16  # looks before it takes the interpreter's lock, so that its caller need not wait
+PIECES = 2  # for each thread, so that a faster one does more
 
 
 class _Apart(Compiler):
@@ -33,19 +43,107 @@ SHARED: dict[str, Any] = {
 }
 
 
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+_sched_yield = types.ExternalFunction('sched_yield', types.int32())
+
+
+@njit(cache=True, nogil=True)
+def _rest(turns):  # type: ignore[no-untyped-def]
+    """Say that a share is done; return when the next is there, or after a while."""
+    turns[DONE] += 1
+    asked = 0
+    for _ in range(PATIENCE):
+        asked += turns[ASKED] != turns[DONE]
+        if asked > HEAD_START:
+            break
+        _sched_yield()
+
+
+@njit(cache=True, nogil=True)
+def _await(turns):  # type: ignore[no-untyped-def]
+    """Return when the share is done, or after a while."""
+    for _ in range(PATIENCE):
+        if turns[ASKED] == turns[DONE]:
+            break
+        _sched_yield()
+
+
+class _Worker(Thread):
+    """
+    A thread that does share after share, each for whoever took it from `_idle`.
+
+    What counts goes through the queues; the turns only tell when it is worth looking there.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(name='on_threads', daemon=True)
+        self._shares: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._outcomes: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._turns = np.array([0, -1])
+        self.start()
+
+    def run(self) -> None:
+        while True:
+            _rest(self._turns)
+            self._outcomes.put(_outcome(self._shares.get()))
+
+    def ask(self, share: Callable[[], None]) -> None:
+        """Give it a share."""
+        self._shares.put(share)
+        self._turns[ASKED] += 1
+
+    def outcome(self) -> BaseException | None:
+        """Wait for the end of the share, unless it has not begun: then take it back."""
+        try:
+            self._shares.get_nowait()
+        except Empty:
+            _await(self._turns)
+            return self._outcomes.get()
+        self._turns[ASKED] -= 1
+        return None
+
+
+_idle: list[_Worker] = []
+
+
+def _worker() -> _Worker:
+    while _idle:
+        worker = _idle.pop()
+        if worker.is_alive():  # not after a fork
+            return worker
+    return _Worker()
+
+
+def _outcome(share: Callable[[], None]) -> BaseException | None:
+    try:
+        share()
+    except BaseException as error:
+        return error
+    return None
+
+
+def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: Any) -> None:
+    for first, end in pieces:
+        kernel(first, end, *data)
 
 
 def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
-    """Call kernel(first, end, *data) on even shares of 0..count, one for each numba thread."""
+    """
+    Call kernel(first, end, *data) on pieces of 0..count, on as many threads as numba may use.
+
+    What the kernel raises is raised when all threads have ended. Any thread may call, and so may
+    a kernel.
+    """
     threads = min(get_num_threads(), count)
     if threads < 2:
         kernel(0, count, *data)
         return
-    ends = [k * count // threads for k in range(threads + 1)]
-    others = [_pool().submit(kernel, ends[k], ends[k + 1], *data) for k in range(1, threads)]
-    kernel(0, ends[1], *data)
-    for other in others:
-        other.result()
+    many = min(threads * PIECES, count)
+    pieces = iter([(k * count // many, (k + 1) * count // many) for k in range(many)])
+    share = partial(_work, kernel, pieces, data)
+    workers = [_worker() for _ in range(1, threads)]
+    for worker in workers:
+        worker.ask(share)
+    outcomes = [_outcome(share), *(worker.outcome() for worker in workers)]
+    _idle.extend(workers)
+    for error in filter(None, outcomes):
+        raise error
