@@ -119,7 +119,6 @@ def test_many_may_ask_at_once(use):
 AFTERWARDS = """
 import multiprocessing, time
 from depth_deblur_ros.core import threads
-threads._rest(threads.np.array([0, -1]))  # compiled
 threads.get_num_threads = lambda: 2
 
 def use():

@@ -78,7 +78,9 @@ class _Worker(Thread):
         super().__init__(name='on_threads', daemon=True)
         self._shares: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._outcomes: SimpleQueue[BaseException | None] = SimpleQueue()
-        self._turns = np.array([0, -1])
+        self._turns = np.array([0, -2])
+        for wait in (_rest, _await):  # compiled here: the end of the process cuts a worker off
+            wait(self._turns)
         self.start()
 
     def run(self) -> None:
