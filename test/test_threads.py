@@ -97,16 +97,19 @@ def test_what_a_share_raises_comes_when_the_others_have_ended(both, failing):
     np.testing.assert_allclose(roots(), ROOTS, rtol=1e-12)
 
 
-def test_a_share_may_share_its_work(both):
-    found = []
+def test_what_a_share_asks_for_its_own_thread_does(both):
+    found, inside = [], []
 
     def work(first, end):
         both.wait()
-        found.append(roots())
+        on_threads(lambda *_: inside.append(threading.get_ident()), 8)
+        found.append((threading.get_ident(), roots()))
 
     on_threads(work, 2)
-    assert len(found) == 2
-    np.testing.assert_allclose(found, [ROOTS, ROOTS], rtol=1e-12)
+    callers, values = zip(*found, strict=True)
+    assert sorted(inside) == sorted(callers)
+    np.testing.assert_allclose(values, [ROOTS, ROOTS], rtol=1e-12)
+    on_threads(lambda *_: both.wait(), 2)  # and shares again afterwards
 
 
 def test_many_may_ask_at_once(use):

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
-from threading import Thread
+from threading import local, Thread
 from typing import Any
 
 from numba import get_num_threads, njit, types
@@ -105,6 +105,7 @@ class _Worker(Thread):
 
 
 _idle: list[_Worker] = []
+_here = local()  # sharing: whether this thread works on a share
 
 
 def _worker() -> _Worker:
@@ -124,18 +125,22 @@ def _outcome(share: Callable[[], None]) -> BaseException | None:
 
 
 def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: Any) -> None:
-    for first, end in pieces:
-        kernel(first, end, *data)
+    _here.sharing = True
+    try:
+        for first, end in pieces:
+            kernel(first, end, *data)
+    finally:
+        _here.sharing = False
 
 
 def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     """
     Call kernel(first, end, *data) on pieces of 0..count, on as many threads as numba may use.
 
-    What the kernel raises is raised when all threads have ended. Any thread may call, and so may
-    a kernel.
+    What the kernel raises is raised when all threads have ended. Any thread may call; what a share
+    itself asks for, its own thread does alone.
     """
-    threads = min(get_num_threads(), count)
+    threads = 1 if getattr(_here, 'sharing', False) else min(get_num_threads(), count)
     if threads < 2:
         kernel(0, count, *data)
         return
