@@ -16,7 +16,7 @@ rows may see different turns.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import itertools
+from functools import lru_cache
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
@@ -37,6 +37,7 @@ from depth_deblur_ros.core.templates import (
     Blocks,
     blocks_around,
     HALF,
+    in_blocks,
     matches,
     PATCH,
     product,
@@ -124,26 +125,57 @@ def _spectra(
 
     Patches one above the other share the transforms of their common rows.
     """
-    window = np.hanning(PATCH + 2)[1:-1].astype(np.float32)
     power = np.zeros((len(corners), len(bins)), np.float32)
     weight = np.zeros(len(corners), np.float32)
-    places = bins // HALF * BAND_COLUMNS + bins % HALF
     ys, xs = np.array(corners).T
-    fields, columns = [difference * valid for difference in _differences(grey)], np.unique(xs)
+    fields, columns = _differences(grey) * valid, np.unique(xs)
 
     def add(first: int, end: int) -> None:
-        for x, field in itertools.product(columns[first:end], fields):
-            strip = window * field[:, x : x + PATCH]
-            square = np.square(strip).sum(1)
-            rows = np.fft.rfft(strip, axis=1)[:, :BAND_COLUMNS]
+        for x in columns[first:end]:
             own = np.flatnonzero(xs == x)
-            cut = np.array([rows[y : y + PATCH] for y in ys[own]]) * window[:, None]
-            found = np.fft.fft(cut, axis=1).reshape(len(own), -1)[:, places]
-            power[own] += found.real**2 + found.imag**2
-            weight[own] += [(window**2 * square[y : y + PATCH]).sum() for y in ys[own]]
+            strip = fields[:, :, x : x + PATCH]
+            power[own] = _powers(strip, ys[own])[:, bins]
+            weight[own] = _mean_squares(strip, ys[own])
 
     on_threads(add, len(columns))
-    return power, weight / np.float32(PATCH**2)
+    return power, weight
+
+
+def _powers(strip: FloatImage, tops: npt.NDArray[np.intp]) -> FloatImage:
+    """Give the spectra (B, PATCH HALF) of patches of a strip (2, H, PATCH), zero beyond BAND."""
+    across = _transformed(strip)[:, tops[:, None] + np.arange(PATCH)]
+    both = _transformed(np.moveaxis(across, 2, -1))  # (2, B, 2, BAND_COLUMNS, 2, BAND_COLUMNS)
+    cc, cs, sc, ss = both.transpose(2, 4, 0, 1, 5, 3).reshape(4, 2, len(tops), BAND_COLUMNS, -1)
+    power = np.zeros((len(tops), PATCH, HALF), np.float32)
+    power[:, :BAND_COLUMNS, :BAND_COLUMNS] = (np.square(cc - ss) + np.square(cs + sc)).sum(0)
+    up = (np.square(cc + ss) + np.square(cs - sc)).sum(0)
+    power[:, :-BAND_COLUMNS:-1, :BAND_COLUMNS] = up[:, 1:]
+    return power.reshape(len(tops), -1)
+
+
+def _mean_squares(strip: FloatImage, tops: npt.NDArray[np.intp]) -> FloatImage:
+    """Give the mean square (B,) of patches of a strip (2, H, PATCH) under the window."""
+    window = np.square(_window())
+    rows = np.einsum('fyx,x->y', np.square(strip), window)
+    return np.asarray(rows[tops[:, None] + np.arange(PATCH)] @ window / np.float32(PATCH**2))
+
+
+def _window() -> FloatImage:
+    return np.hanning(PATCH + 2)[1:-1].astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _waves() -> FloatImage:
+    """Give cosines and sines of the band under the window, as `product` wants them."""
+    angle = 2 * np.pi / PATCH * np.outer(np.arange(PATCH), np.arange(BAND_COLUMNS))
+    waves = np.concatenate([np.cos(angle), np.sin(angle)], 1)
+    return in_blocks((_window()[:, None] * waves).astype(np.float32))
+
+
+def _transformed(strips: FloatImage) -> FloatImage:
+    """Give the cosine and sine transforms (..., 2, BAND_COLUMNS) of rows (..., PATCH)."""
+    found = product(strips.reshape(-1, PATCH), _waves())[:, : 2 * BAND_COLUMNS]
+    return found.reshape(*strips.shape[:-1], 2, BAND_COLUMNS)
 
 
 def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -156,10 +188,11 @@ def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
     return grid[:: -(-len(grid) // MAX_PATCHES)]
 
 
-def _differences(grey: FloatImage) -> tuple[FloatImage, FloatImage]:
+def _differences(grey: FloatImage) -> FloatImage:
+    """Give the gradient (2, H, W), x and y."""
     kernel = np.array([[-0.5, 0, 0.5]], np.float32)
     gx, gy = cv2.filter2D(grey, -1, kernel), cv2.filter2D(grey, -1, kernel.T.copy())
-    return np.asarray(gx, np.float32), np.asarray(gy, np.float32)
+    return np.array([gx, gy], np.float32)
 
 
 def _flow_of_q(
