@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-ENOUGH = 20_000  # pixels that tell the mean length of a blur
+ENOUGH = 6_000  # pixels that tell the mean length of a blur
 
 
 def normalised_grid(camera: CameraIntrinsics) -> tuple[Array, Array]:

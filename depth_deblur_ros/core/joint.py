@@ -41,7 +41,8 @@ LONGEST_MOVE = 1.0  # px
 # What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
 # by a curve follows sRGB's only about, and the parts share what that gets wrong.
 SOFTEST = 10.0
-DISSENT = {'linear': 10.0, 'srgb': 40.0}
+DISSENT = {'linear': 6.0, 'srgb': 25.0}
+FLATTER = 0.65  # than its first curvature the likelihood is on the way to its optimum
 BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 
 
@@ -102,7 +103,7 @@ def _moved(
     """Go where the slope of the likelihood and the pull of the start balance."""
     parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), pull.start
-    bend = bends.sum(0)
+    bend = FLATTER * bends.sum(0)
     for k in range(effort.moves):
         soft = _softening(gs, bends, pull.dissent)
         force = gs.sum(0) / soft + pull.certainty @ (p - pull.start)
@@ -142,11 +143,17 @@ def _each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]
 
 
 def _softening(gs: Vector, bends: Vector, dissent: float) -> float:
-    """Give the divisor: dissent per chi^2 of parts (n, 9), (n, 9, 9) about their optimum."""
-    common = -np.linalg.solve(bends.sum(0), gs.sum(0))
-    left = gs + bends @ common
-    chi = float(np.sum(left * np.linalg.solve(bends, left[..., None])[..., 0]))
-    return max(SOFTEST, dissent * chi / float(gs[1:].size))
+    """
+    Give the divisor, by how far the slopes gs (n, 9) of the parts are apart at their optimum.
+
+    Far is what would move that optimum: a part that tells little may be as wrong as it likes.
+    """
+    inverse = np.linalg.inv(bends.sum(0))
+    shares = inverse @ bends
+    apart = gs - gs.sum(0) @ shares
+    found = float(np.einsum('ni,ij,nj', apart, inverse, apart))
+    by_chance = len(inverse) - float(np.einsum('nij,nji', shares, shares))
+    return max(SOFTEST, dissent * found / by_chance)
 
 
 def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:

@@ -220,12 +220,15 @@ def _settled(q: Vector, scales: list[Scale], radius: float) -> Vector:
 
 def slope_and_bend(q: Vector, scales: list[Scale]) -> tuple[Vector, Vector]:
     """Give slope (9,) and curvature (9, 9) of the common score at q, by differences."""
-    steps = BEND * np.eye(q.size)
-    corners = [q + a * one + b * other for one in steps for other in steps for a, b in _CORNERS]
-    value = common_score(np.array(corners), scales).reshape(q.size, q.size, 4)
-    bend = value @ np.array([1, -1, -1, 1]) / (4 * BEND**2)
+    steps, size = BEND * np.eye(q.size), q.size
+    first, second = np.triu_indices(size)
+    corners = [q + a * steps[first] + b * steps[second] for a, b in _CORNERS]
+    value = common_score(np.concatenate(corners), scales).reshape(len(_CORNERS), -1)
+    bend = np.empty((size, size))
+    bend[first, second] = np.array([1, -1, -1, 1]) @ value / (4 * BEND**2)
+    bend[second, first] = bend[first, second]
     sides = common_score(np.concatenate([q + steps, q - steps]), scales)
-    return (sides[: q.size] - sides[q.size :]) / (2 * BEND), bend
+    return (sides[:size] - sides[size:]) / (2 * BEND), bend
 
 
 def _by_rows(qs: Vector) -> Vector:
