@@ -13,7 +13,6 @@ covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 import math
@@ -25,11 +24,7 @@ from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Pace, Part, posterior, settled, slope_of
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.start import Start
-from numba import (  # type: ignore[attr-defined]
-    get_num_threads,
-    set_num_threads,
-    threading_layer,
-)
+from depth_deblur_ros.core.threads import on_threads
 import numpy as np
 
 Result = TypeVar('Result')
@@ -130,16 +125,13 @@ def _begun(part: Part, p: Vector) -> tuple[Part, Vector, Vector]:
 
 def _each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """Work on the parts side by side: they are too small for two threads to share one."""
-    threads = get_num_threads()  # starts numba's threads, if none run yet
-    if threading_layer() == 'workqueue':  # without OpenMP; ends the process of two callers
-        return [work(part) for part in parts]
+    found: dict[int, Result] = {}
 
-    def alone(part: Part) -> Result:
-        set_num_threads(max(1, threads // len(parts)))
-        return work(part)
+    def some(first: int, end: int) -> None:
+        found.update({k: work(parts[k]) for k in range(first, end)})
 
-    with ThreadPoolExecutor(min(threads, len(parts))) as pool:
-        return list(pool.map(alone, parts))
+    on_threads(some, len(parts))
+    return [found[k] for k in range(len(parts))]
 
 
 def _softening(gs: Vector, bends: Vector, dissent: float) -> float:
