@@ -123,7 +123,8 @@ def blind_start(
         return _nothing(Outcome.SHARP if edges.along > RATHER_SHARP else Outcome.FAILED, axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     covariance = _covariance(q, scales, axes)
-    doubt = LONELY_DOUBT if len(scales) == 1 and quality < LONELY else 1.0
+    lonely = len(scales) == 1 and quality < LONELY
+    doubt = LONELY_DOUBT if lonely else 1 / quality
     if scales[-1].factor == CLOSE:
         q = q * math.sqrt(1 - (CLOSE_BIAS / length(q)) ** 2)
     motion = Motion.from_vector(axes @ q, covariance[:6, :6])
