@@ -5,7 +5,7 @@ usage: python scripts/calibrate.py [--frames N] [--first N] [--modes MODE ...] [
        [--blurs LOW HIGH] [--vga] [--keep FILE.jsonl] [--plot FILE.svg] [--worst FOLDER]
 
 Rooms, paths and blurs (2 to 40 px on 320x240) are drawn anew, from numbers that nothing else in
-the project uses; the solver's constants were set on some of the first 1500, so --first 1500 asks
+the project uses; the solver's constants were set on some of the first 1800, so --first 1800 asks
 frames that are new to it. Prints, for each mode and axis of the motion, how many of the true
 motions lie within one and three standard deviations of what was solved, but for the sign; the
 plot tells it for all numbers of deviations. --worst draws the five frames with the worst flow;
