@@ -25,7 +25,7 @@ ENOUGH = 15_000  # pixels or more that are looked at; the ratio is then good to 
 # By scripts/calibrate.py: shares of the covariances that the spectra and the likelihood give, and
 # what no picture tells better of q: two shifts, roll, zoom, two parallaxes [px].
 OF_SPECTRA = 0.12
-OF_LIKELIHOOD = {'linear': 0.58, 'srgb': 0.165}
+OF_LIKELIHOOD = {'linear': 0.6, 'srgb': 0.172}
 LEAST_ERROR = (0.07, 0.07, 0.13, 0.05, 0.03, 0.03)
 
 
