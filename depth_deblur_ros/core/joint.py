@@ -48,7 +48,7 @@ class Effort:
     pixels: int
     moves: int = 4
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
-    enough: float = 0.1  # px; the first move that is shorter is the last
+    enough: float = 0.15  # px; the first move that is shorter is the last
     doubt: float = 1.0  # times as large is the covariance as that of a refinement to the end
     pace: Pace = field(default_factory=Pace)
 
