@@ -22,8 +22,8 @@ from depth_deblur_ros.core.instants import flow_at
 from depth_deblur_ros.core.lanes import greatest, larger, load, splat, whole_blocks, WIDTH
 from depth_deblur_ros.core.seen import flow_parts, nearness_of, pack, seen_by_pixel, seen_planes
 from depth_deblur_ros.core.sweep import Sweep, sweep_of
-from depth_deblur_ros.core.threads import on_threads, SHARED
-from numba import get_num_threads, njit
+from depth_deblur_ros.core.threads import on_threads, SHARED, threads_here
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -88,7 +88,7 @@ class BlurOperator:
         if blurred.dtype == np.float32:
             return self._adjoint_by_blocks(blurred)
         rows = self.inverse_depth.shape[0]
-        strips = min(get_num_threads(), rows)
+        strips = min(threads_here(), rows)
         height, width, _ = self.latent_shape
         depth_of_strip = math.ceil(rows / strips) + 2 * self.margin
         parts = np.zeros((strips, depth_of_strip, width, 3), blurred.dtype)

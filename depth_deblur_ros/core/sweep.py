@@ -31,8 +31,8 @@ from depth_deblur_ros.core.lanes import (
     whole_blocks,
     WIDTH,
 )
-from depth_deblur_ros.core.threads import on_threads, SHARED
-from numba import get_num_threads, njit
+from depth_deblur_ros.core.threads import on_threads, SHARED, threads_here
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -93,7 +93,7 @@ class Sweep:
     def strips(self) -> FloatImage:
         """Room for what each thread of `scatter` writes: (n, 3, rows, w)."""
         height = self.nearness.shape[0]
-        count = min(get_num_threads(), height)
+        count = min(threads_here(), height)
         _, _, wide = self.latent_shape
         return np.empty((count, 3, math.ceil(height / count) + 2 * self.room, wide), np.float32)
 

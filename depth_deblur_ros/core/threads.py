@@ -133,6 +133,11 @@ def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: 
         _here.sharing = False
 
 
+def threads_here() -> int:
+    """Give how many threads `on_threads` may use: one within a share, else as many as numba."""
+    return 1 if getattr(_here, 'sharing', False) else get_num_threads()
+
+
 def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     """
     Call kernel(first, end, *data) on pieces of 0..count, on as many threads as numba may use.
@@ -140,7 +145,7 @@ def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     What the kernel raises is raised when all threads have ended. Any thread may call; what a share
     itself asks for, its own thread does alone.
     """
-    threads = 1 if getattr(_here, 'sharing', False) else min(get_num_threads(), count)
+    threads = min(threads_here(), count)
     if threads < 2:
         kernel(0, count, *data)
         return
