@@ -71,7 +71,7 @@ class Start:
     The first motion (zero unless solved), what it is worth, and axes G.
 
     spread (9, 9): covariance of the motion by rows, if it is the right one; doubt: how many times
-    larger, as it may be another.
+    larger, as shallow bands err more and it may be another.
     """
 
     motion: Motion
