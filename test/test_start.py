@@ -71,6 +71,20 @@ def test_a_sharp_picture_is_sharp(seed):
     assert result.quality == 1
 
 
+def test_a_picture_that_is_sharp_somewhere_is_not_sharp_where_bands_are_seen():
+    def sharp(along, evenly, seen, alone=False):
+        edges = SimpleNamespace(along=along, evenly=evenly)
+        return start._without_motion(edges, seen, alone=alone) is Outcome.SHARP
+
+    assert sharp(1.1, 1.1, 0.2)
+    assert not sharp(1.05, 1.1, 0.1)
+    assert not sharp(1.1, 1.0, 0.2)
+    assert not sharp(1.1, 1.1, 0.3)  # no sharp picture leaves so deep bands
+    assert sharp(1.1, 1.0, 0.1)
+    assert not sharp(1.1, 1.0, 0.1, alone=True)  # one scale misses long blurs
+    assert sharp(1.2, 1.0, 0.1, alone=True)
+
+
 def test_a_still_camera_is_still_to_within_the_shortest_blur():
     still = blind_start(texture(0), DEPTH, CAMERA)
     expected = (start.SHORTEST / 2) ** 2 * np.eye(6)

@@ -5,6 +5,7 @@ from depth_deblur_ros.core.data import Motion
 from depth_deblur_ros.core.trust import (
     calibrated,
     covariance_from_curvature,
+    Edges,
     LEAST_ERROR,
     sharpness,
 )
@@ -31,6 +32,18 @@ def test_blur_along_any_direction_is_seen(angle):
     least, most = sharpness(swept(texture(2), 10, angle))
     assert least < 1.06
     assert most > 1.07
+
+
+def test_what_is_blurred_somewhere_is_not_evenly_sharp():
+    grey = texture(0)
+    height, width = grey.shape
+    partly, plain = grey.copy(), grey.copy()
+    partly[: height // 2, : width // 2] = swept(grey, 24)[: height // 2, : width // 2]
+    plain[: height // 2, : width // 2] = 0.5
+    assert Edges(grey).evenly > 1.1
+    assert Edges(partly).along > 1.1
+    assert Edges(partly).evenly < 1.045
+    assert Edges(plain).evenly > 1.1  # a quarter without edges tells nothing
 
 
 def test_noise_is_sharp():

@@ -52,6 +52,8 @@ CLEARLY_SHARP, RATHER_SHARP = (
     1.15,
     1.065,
 )  # trust.sharpness: nothing to search; no motion and no blur
+EVENLY_SHARP = 1.048  # trust.Edges.evenly; a picture with less is sharp only somewhere
+BANDED, DEEP = 0.15, 0.27  # -S close up from which on such a picture, and any, is blurred
 OUT_OF_FOCUS = 1.07  # trust.sharpness across the motion, which leaves that as it is
 EDGED = 1.035  # edges of a picture with so little blur that it is seen close up alone
 HALVED = 24.0  # px; shorter motions are no halves of what the full scale cannot see
@@ -96,7 +98,7 @@ def blind_start(
     """
     axes = motion_axes(depth, camera)
     edges = Edges(grey)
-    if edges.along > CLEARLY_SHARP:
+    if edges.along > CLEARLY_SHARP and edges.evenly > EVENLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
     spectra = look(grey, depth, camera, axes) if edges.across > OUT_OF_FOCUS else {}
     if not spectra:
@@ -107,7 +109,7 @@ def blind_start(
 
     first = np.asarray(np.linalg.solve(axes, guess.by_rows)) if guess else None
     q, scales = _found(spectra, first, length, edges)
-    trusted = _trusted(q, length(q), scales, edges)
+    seen, trusted = 0.0, _trusted(q, length(q), scales, edges)
     alone = trusted and len(spectra) == 1 and guess is None and length(q) > WITNESSED
     if alone and _refuted(q, spectra | look_again(grey, depth, camera, axes), length, edges):
         return _nothing(Outcome.FAILED, axes)
@@ -115,20 +117,33 @@ def blind_start(
     if look_closer and scales[0].factor == 1:
         close = close_up(grey, depth, camera, axes)
         closer, both = find_short(scales[0], close, q if trusted else None)
+        seen = float(-common_score(closer[None], both)[0])
         if _short_trusted(closer, length(closer), both):
             q, scales, trusted = closer, both, True
         elif len(scales) == 1:  # nobody has confirmed it
             trusted = False
     if not trusted:
-        return _nothing(Outcome.SHARP if edges.along > RATHER_SHARP else Outcome.FAILED, axes)
+        return _nothing(_without_motion(edges, seen, alone=len(spectra) == 1), axes)
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     covariance = _covariance(q, scales, axes)
-    lonely = len(scales) == 1 and quality < LONELY
-    doubt = LONELY_DOUBT if lonely else 1 / quality
+    doubt = LONELY_DOUBT if len(scales) == 1 and quality < LONELY else 1 / quality
     if scales[-1].factor == CLOSE:
         q = q * math.sqrt(1 - (CLOSE_BIAS / length(q)) ** 2)
     motion = Motion.from_vector(axes @ q, covariance[:6, :6])
     return Start(motion, Outcome.SOLVED, quality, axes, covariance, doubt)
+
+
+def _without_motion(edges: Edges, seen: float, *, alone: bool) -> Outcome:
+    """
+    Say that a picture is sharp if its edges are, and not only somewhere; else nothing.
+
+    seen: -S of what is likeliest close up; alone: whether one scale has searched, which misses
+    what two would see.
+    """
+    edged = edges.along > RATHER_SHARP and seen < DEEP
+    unseen = seen < BANDED and (edges.along > CLEARLY_SHARP or not alone)
+    sharp = edged and (edges.evenly > EVENLY_SHARP or unseen)
+    return Outcome.SHARP if sharp else Outcome.FAILED
 
 
 def _found(
