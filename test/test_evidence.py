@@ -5,7 +5,6 @@ from dataclasses import replace
 from depth_deblur_ros.core.data import CameraIntrinsics
 from depth_deblur_ros.core.evidence import (
     _corners,
-    _spectra,
     EVEN,
     Evidence,
     gather_spectra,
@@ -15,6 +14,7 @@ from depth_deblur_ros.core.evidence import (
     thinned,
 )
 from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.spectra import patch_spectra
 from depth_deblur_ros.core.templates import ACROSS, PATCH, REACH, template_table
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -55,7 +55,7 @@ def test_spectra_are_those_of_each_patch_by_itself(table):
     grey = swept(texture(1), 7)
     valid = np.random.default_rng(0).random(grey.shape, np.float32)
     corners = [(0, 0), (48, 0), (144, 0), (48, 100), (144, 224)]
-    power, weight = _spectra(grey, valid, corners, table.bins)
+    power, weight = patch_spectra(grey, valid, corners, table.bins)
     gy, gx = (np.pad(d, 1) for d in (grey[2:] - grey[:-2], grey[:, 2:] - grey[:, :-2]))
     gy, gx = gy[:, 1:-1] / 2, gx[1:-1] / 2  # the border mirrors: no gradient across it
     window = np.outer(*[np.hanning(PATCH + 2)[1:-1]] * 2)

@@ -15,7 +15,6 @@ from depth_deblur_ros.core.latent import (
 from depth_deblur_ros.core.light import light_from_stored, light_slope, stored_from_light
 from depth_deblur_ros.core.quadratic import (
     _link_weights,
-    _POWERS,
     _sum_rows,
     conjugate_gradients,
     EPSILON,
@@ -68,7 +67,7 @@ def restored(taken, blur, transfer, sigma, steps):
 
 def links_of(stored):
     links = np.zeros((4, *stored.shape[1:]), np.float32)
-    _link_weights(0, stored.shape[1], stored, WEIGHT, _POWERS, links)
+    _link_weights(0, stored.shape[1], stored, WEIGHT, links)
     return links
 
 

@@ -84,10 +84,18 @@ def test_a_sharp_optimum_is_worth_its_curvature():
 def test_a_calibrated_covariance_is_a_share_of_the_old_and_the_least_error():
     axes = np.diag([1.0, 2, 3, 4, 5, 6])
     motion = Motion.from_vector(np.arange(6.0), np.eye(6))
-    found = calibrated(motion, axes, 0.25)
+    found = calibrated(motion, axes, 0.25, 0.0)
     np.testing.assert_array_equal(found.vector, motion.vector)
     expected = np.diag(0.25 + np.square(np.diag(axes) * LEAST_ERROR))
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-12)
-    sure = calibrated(Motion.from_vector(motion.vector), axes, 0.25)
+    sure = calibrated(Motion.from_vector(motion.vector), axes, 0.25, 0.0)
     deviations = np.sqrt(np.diag(sure.covariance)) / np.diag(axes)
     np.testing.assert_allclose(deviations, LEAST_ERROR)
+
+
+def test_parallaxes_of_long_blurs_are_less_certain():
+    """Depth errs by a share, and so does what is told by it."""
+    motion = Motion.from_vector(np.zeros(6))
+    short, long = (np.diag(calibrated(motion, np.eye(6), 1.0, px).covariance) for px in (0, 50))
+    np.testing.assert_array_equal(short[:4], long[:4])
+    assert (np.sqrt(long[4:]) > [0.35, 0.15]).all()

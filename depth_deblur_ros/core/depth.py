@@ -22,8 +22,8 @@ import math
 
 import cv2
 from depth_deblur_ros.core.data import FloatImage, InputError
-from depth_deblur_ros.core.threads import on_threads, SHARED
-from numba import config, get_num_threads, njit, set_num_threads
+from depth_deblur_ros.core.threads import at_most, on_threads, SHARED
+from numba import njit
 import numpy as np
 import numpy.typing as npt
 
@@ -53,11 +53,9 @@ def fill_depth(depth: FloatImage, guide: FloatImage, *, threads: int) -> FloatIm
         raise InputError('depth has no measured pixel: 100 % of it are holes')
     filled = np.where(measured, depth, np.float32(0))
     colours = np.ascontiguousarray(guide).reshape(*depth.shape, -1)
-    before = get_num_threads()
-    set_num_threads(min(threads, config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-    seeds = find_seeds(filled, measured, colours)
-    on_threads(_fill, len(filled), filled, measured, colours, *seeds)
-    set_num_threads(before)
+    with at_most(threads):
+        seeds = find_seeds(filled, measured, colours)
+        on_threads(_fill, len(filled), filled, measured, colours, *seeds)
     return filled
 
 

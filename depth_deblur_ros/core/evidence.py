@@ -16,9 +16,7 @@ rows may see different turns.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
-import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
 from depth_deblur_ros.core.geometry import interaction_matrix, rows_matrix
 from depth_deblur_ros.core.lanes import (
@@ -31,23 +29,19 @@ from depth_deblur_ros.core.lanes import (
     whole,
     WIDTH,
 )
+from depth_deblur_ros.core.spectra import patch_spectra
 from depth_deblur_ros.core.templates import (
     ACROSS,
-    BAND_COLUMNS,
     Blocks,
     blocks_around,
-    HALF,
-    in_blocks,
     matches,
     PATCH,
     product,
     REACH,
     template_table,
 )
-from depth_deblur_ros.core.threads import on_threads
 from numba import njit, prange
 import numpy as np
-import numpy.typing as npt
 
 STEP = 48  # px between patches
 CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sensor
@@ -101,7 +95,7 @@ def gather_spectra(
     """
     table = template_table()
     corners = _corners(grey.shape)
-    power, weight = _spectra(grey, valid, corners, table.bins)
+    power, weight = patch_spectra(grey, valid, corners, table.bins)
     logs = np.log(power + np.float32(1e-12))
     there, back = table.nuisance_blocks
     logs -= product(product(logs, there)[:, : len(table.nuisance.T)], back)[:, : len(table.bins)]
@@ -114,70 +108,6 @@ def gather_spectra(
     )
 
 
-def _spectra(
-    grey: FloatImage,
-    valid: FloatImage,
-    corners: list[tuple[int, int]],
-    bins: npt.NDArray[np.intp],
-) -> tuple[FloatImage, FloatImage]:
-    """
-    Give the gradients' spectrum (B, n) of each patch in the bins, and their mean square (B,).
-
-    Patches one above the other share the transforms of their common rows.
-    """
-    power = np.zeros((len(corners), len(bins)), np.float32)
-    weight = np.zeros(len(corners), np.float32)
-    ys, xs = np.array(corners).T
-    fields, columns = _differences(grey) * valid, np.unique(xs)
-
-    def add(first: int, end: int) -> None:
-        for x in columns[first:end]:
-            own = np.flatnonzero(xs == x)
-            strip = fields[:, :, x : x + PATCH]
-            power[own] = _powers(strip, ys[own])[:, bins]
-            weight[own] = _mean_squares(strip, ys[own])
-
-    on_threads(add, len(columns))
-    return power, weight
-
-
-def _powers(strip: FloatImage, tops: npt.NDArray[np.intp]) -> FloatImage:
-    """Give the spectra (B, PATCH HALF) of patches of a strip (2, H, PATCH), zero beyond BAND."""
-    across = _transformed(strip)[:, tops[:, None] + np.arange(PATCH)]
-    both = _transformed(np.moveaxis(across, 2, -1))  # (2, B, 2, BAND_COLUMNS, 2, BAND_COLUMNS)
-    cc, cs, sc, ss = both.transpose(2, 4, 0, 1, 5, 3).reshape(4, 2, len(tops), BAND_COLUMNS, -1)
-    power = np.zeros((len(tops), PATCH, HALF), np.float32)
-    power[:, :BAND_COLUMNS, :BAND_COLUMNS] = (np.square(cc - ss) + np.square(cs + sc)).sum(0)
-    up = (np.square(cc + ss) + np.square(cs - sc)).sum(0)
-    power[:, :-BAND_COLUMNS:-1, :BAND_COLUMNS] = up[:, 1:]
-    return power.reshape(len(tops), -1)
-
-
-def _mean_squares(strip: FloatImage, tops: npt.NDArray[np.intp]) -> FloatImage:
-    """Give the mean square (B,) of patches of a strip (2, H, PATCH) under the window."""
-    window = np.square(_window())
-    rows = np.einsum('fyx,x->y', np.square(strip), window)
-    return np.asarray(rows[tops[:, None] + np.arange(PATCH)] @ window / np.float32(PATCH**2))
-
-
-def _window() -> FloatImage:
-    return np.hanning(PATCH + 2)[1:-1].astype(np.float32)
-
-
-@lru_cache(maxsize=1)
-def _waves() -> FloatImage:
-    """Give cosines and sines of the band under the window, as `product` wants them."""
-    angle = 2 * np.pi / PATCH * np.outer(np.arange(PATCH), np.arange(BAND_COLUMNS))
-    waves = np.concatenate([np.cos(angle), np.sin(angle)], 1)
-    return in_blocks((_window()[:, None] * waves).astype(np.float32))
-
-
-def _transformed(strips: FloatImage) -> FloatImage:
-    """Give the cosine and sine transforms (..., 2, BAND_COLUMNS) of rows (..., PATCH)."""
-    found = product(strips.reshape(-1, PATCH), _waves())[:, : 2 * BAND_COLUMNS]
-    return found.reshape(*strips.shape[:-1], 2, BAND_COLUMNS)
-
-
 def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
     """Spread patches evenly over the image, about STEP apart, from border to border."""
     spots = []
@@ -186,13 +116,6 @@ def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
         spots.append(np.linspace(0, side - PATCH, count).round().astype(int))
     grid = [(int(y), int(x)) for y in spots[0] for x in spots[1]]
     return grid[:: -(-len(grid) // MAX_PATCHES)]
-
-
-def _differences(grey: FloatImage) -> FloatImage:
-    """Give the gradient (2, H, W), x and y."""
-    kernel = np.array([[-0.5, 0, 0.5]], np.float32)
-    gx, gy = cv2.filter2D(grey, -1, kernel), cv2.filter2D(grey, -1, kernel.T.copy())
-    return np.array([gx, gy], np.float32)
 
 
 def _flow_of_q(

@@ -190,6 +190,16 @@ def bits_of(typing: Any, value: Any) -> Any:
 
 
 @_instruction  # type: ignore[untyped-decorator]
+def of_bits(typing: Any, value: Any) -> Any:
+    """Take a whole number as the bits of one float32."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.bitcast(values[0], ir.FloatType())
+
+    return types.float32(types.int32), build
+
+
+@_instruction  # type: ignore[untyped-decorator]
 def where_positive(typing: Any, sign: Any, a: Any, b: Any) -> Any:
     """Give a where sign > 0, else b."""
 

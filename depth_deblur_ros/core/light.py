@@ -2,54 +2,35 @@
 From stored values to light and back.
 
 Light adds up during the exposure, stored values do not: `transfer` (data.py) says how they were
-coded. Notation: v stored value 0..1, l(v) light 0..1, l'(v) its slope. [sRGB] IEC 61966-2-1.
-Powers are looked up in tables, with linear interpolation: that of l(v) has even steps of v, that
-of v(l) even steps within each octave of l, counted by the bits of the float.
+coded. Notation: v stored value 0..1, l(v) light 0..1, l'(v) its slope. [sRGB] IEC 61966-2-1:
+l = u^2.4 = u^3 u^(-3/5), u = (v + 0.055) / 1.055, and v = 1.055 l l^(-7/12) - 0.055, but for the
+darkest, where both are lines.
 """
 
 from __future__ import annotations
 
 from depth_deblur_ros.core.data import FloatImage
-from depth_deblur_ros.core.lanes import bits_of
+from depth_deblur_ros.core.powers import over_seven_twelfths, over_three_fifths
 from depth_deblur_ros.core.threads import on_threads, SHARED
 from numba import njit
 import numpy as np
-import numpy.typing as npt
 
 SLOPE_FLOOR = 0.15  # l' falls to 0.08 in black, where quantisation, not light, decides
-STEPS = 4096  # of v
-OCTAVE_BITS = 9  # 2^9 steps in each octave of l
-LEAST_BITS = (127 - 9) << 23  # of 2^-9, where the tables by octaves begin; sRGB is linear there
 KNEE, GRADIENT = 0.0031308, 12.92  # [sRGB] of light
 LINEAR_TO = 0.04045  # [sRGB] of stored values
-
-
-def _light(v: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Give [sRGB] l(v)."""
-    curved = ((v + 0.055) / 1.055) ** 2.4
-    return np.asarray(np.where(v <= LINEAR_TO, v / GRADIENT, curved))
-
-
-_KNEES = np.arange(STEPS + 2) / STEPS
-_LIGHT = _light(_KNEES).astype(np.float32)
-_SLOPE = (2.4 / 1.055 * ((_KNEES + 0.055) / 1.055) ** 1.4).astype(np.float32)
-_EASE = (1 / np.maximum(_SLOPE, np.float32(SLOPE_FLOOR)) ** 2).astype(np.float32)
-_OCTAVES = (
-    (np.arange((9 << OCTAVE_BITS) + 2) << (23 - OCTAVE_BITS)).astype(np.int32) + LEAST_BITS
-).view(np.float32)
-_STORED = (1.055 * _OCTAVES.astype(np.float64) ** (1 / 2.4) - 0.055).astype(np.float32)
+FINITE = {'nnan', 'ninf', 'nsz', 'contract'}  # what the compiler may take for granted
 
 
 def light_from_stored(stored: FloatImage, transfer: str) -> FloatImage:
     """Give the light l(v) of stored values v in 0..1."""
-    return stored if transfer == 'linear' else _mapped(stored, _look_up, _LIGHT)
+    return stored if transfer == 'linear' else _mapped(stored, _to_light)
 
 
 def stored_from_light(light: FloatImage, transfer: str) -> FloatImage:
     """Give the stored values of light, clipped to 0..1."""
     if transfer == 'linear':
         return np.clip(light, 0, 1)
-    return _mapped(light, _look_up_octaves, _STORED)
+    return _mapped(light, _to_stored)
 
 
 def as_colour(image: FloatImage) -> FloatImage:
@@ -61,41 +42,71 @@ def light_slope(stored: FloatImage, transfer: str) -> FloatImage:
     """Give l'(v), no less than SLOPE_FLOOR: noise of light is noise of v times this."""
     if transfer == 'linear':
         return np.ones_like(stored)
-    slope = _mapped(stored, _look_up, _SLOPE)
-    return np.maximum(slope, np.float32(SLOPE_FLOOR), out=slope)
+    return _mapped(stored, _to_slope)
 
 
 def light_ease(stored: FloatImage, transfer: str) -> FloatImage:
     """Give 1 / l'(v)^2, l' as `light_slope`."""
     if transfer == 'linear':
         return np.ones_like(stored)
-    return _mapped(stored, _look_up, _EASE)
+    return _mapped(stored, _to_ease)
 
 
-def _mapped(values: FloatImage, look_up, table: FloatImage) -> FloatImage:  # type: ignore[no-untyped-def]
-    """Send each value through a table."""
+def _mapped(values: FloatImage, curve) -> FloatImage:  # type: ignore[no-untyped-def]
+    """Send each value through a curve."""
     flat = np.ascontiguousarray(values, np.float32).reshape(-1)
     found = np.empty_like(flat)
-    on_threads(look_up, flat.size, flat, table, found)
+    on_threads(curve, flat.size, flat, found)
     return found.reshape(values.shape)
 
 
-@njit(**SHARED)
-def _look_up(first, end, values, table, found):  # type: ignore[no-untyped-def]
-    for k in range(np.uintp(first), np.uintp(end)):
-        place = STEPS * np.float64(min(max(values[k], np.float32(0)), np.float32(1)))
-        i = np.uint32(place)
-        found[k] = table[i] + (place - i) * (table[i + np.uint32(1)] - table[i])
+@njit(cache=True, nogil=True, inline='always')
+def _within(v):  # type: ignore[no-untyped-def]
+    return min(max(v, np.float32(0)), np.float32(1))
 
 
-@njit(**SHARED)
-def _look_up_octaves(first, end, values, table, found):  # type: ignore[no-untyped-def]
-    part = np.float32(2.0 ** (OCTAVE_BITS - 23))
+@njit(cache=True, nogil=True, inline='always')
+def _base(v):  # type: ignore[no-untyped-def]
+    """Give u of a stored value, 1 of 1."""
+    return np.float32(1) - (np.float32(1) - v) * np.float32(1 / 1.055)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _slope(v):  # type: ignore[no-untyped-def]
+    """Give l'(v), no less than SLOPE_FLOOR, which is more than where it is a line."""
+    u = _base(v)
+    slope = np.float32(2.4 / 1.055) * u * u * over_three_fifths(u)
+    return max(slope, np.float32(SLOPE_FLOOR))
+
+
+# Unsigned indices: numba checks signed ones, and a loop that does is not turned into vector code.
+@njit(fastmath=FINITE, **SHARED)
+def _to_light(first, end, values, found):  # type: ignore[no-untyped-def]
     for k in range(np.uintp(first), np.uintp(end)):
-        if values[k] > np.float32(KNEE):
-            place = np.uint32(min(bits_of(values[k]), 127 << 23) - LEAST_BITS)
-            i = place >> np.uint32(23 - OCTAVE_BITS)
-            rest = part * np.float32(place & np.uint32((1 << (23 - OCTAVE_BITS)) - 1))
-            found[k] = table[i] + rest * (table[i + np.uint32(1)] - table[i])
-        else:
-            found[k] = max(np.float32(GRADIENT) * values[k], np.float32(0))
+        v = _within(values[k])
+        u = _base(v)
+        curved = u * u * u * over_three_fifths(u)
+        found[k] = curved if v > np.float32(LINEAR_TO) else v * np.float32(1 / GRADIENT)
+
+
+@njit(fastmath=FINITE, **SHARED)
+def _to_slope(first, end, values, found):  # type: ignore[no-untyped-def]
+    for k in range(np.uintp(first), np.uintp(end)):
+        found[k] = _slope(_within(values[k]))
+
+
+@njit(fastmath=FINITE, **SHARED)
+def _to_ease(first, end, values, found):  # type: ignore[no-untyped-def]
+    for k in range(np.uintp(first), np.uintp(end)):
+        slope = _slope(_within(values[k]))
+        found[k] = np.float32(1) / (slope * slope)
+
+
+@njit(fastmath=FINITE, **SHARED)
+def _to_stored(first, end, values, found):  # type: ignore[no-untyped-def]
+    for k in range(np.uintp(first), np.uintp(end)):
+        x = _within(values[k])
+        bright = max(x, np.float32(KNEE))
+        root = bright * over_seven_twelfths(bright)
+        curved = np.float32(1) - np.float32(1.055) * (np.float32(1) - root)
+        found[k] = curved if x > np.float32(KNEE) else np.float32(GRADIENT) * x

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import math
 
 from depth_deblur_ros.core.data import FloatImage
-from depth_deblur_ros.core.lanes import bits_of, load, smaller, splat, store, total, WIDTH
+from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_ease
+from depth_deblur_ros.core.powers import over_three_fifths
 from depth_deblur_ros.core.sweep import GUARD, Sweep
 from depth_deblur_ros.core.threads import on_threads, SHARED
 from numba import njit
@@ -61,7 +62,7 @@ def reweighted(
 ) -> Quadratic:
     """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
     links = np.zeros((4, *stored.shape[1:]), np.float32)
-    on_threads(_link_weights, stored.shape[1], stored, weight, _POWERS, links)
+    on_threads(_link_weights, stored.shape[1], stored, weight, links)
     return Quadratic(sweep, trust, links, light_ease(stored, transfer))
 
 
@@ -90,43 +91,37 @@ def conjugate_gradients(
     return latent
 
 
-# x^(EXPONENT / 2 - 1) from 2^-14 to 2, in even steps within each octave, counted by a float's bits
-POWER_BITS = 6  # 2^6 steps in each octave
-_POWER_FROM, _POWER_SHIFT = (127 - 14) << 23, 23 - POWER_BITS
-_POWERS = (
-    (_POWER_FROM + (np.arange((15 << POWER_BITS) + 2) << _POWER_SHIFT).astype(np.int32))
-    .view(np.float32)
-    .astype(np.float64)
-    ** (EXPONENT / 2 - 1)
-).astype(np.float32)
+@njit(cache=True, nogil=True, inline='always')
+def _weight(x):  # type: ignore[no-untyped-def]
+    """Weigh differences whose mean square is x: x^(EXPONENT / 2 - 1), [IRLS]."""
+    return over_three_fifths(x)
 
 
+# Flat images and unsigned indices: numba checks signed ones for negative values, and a loop that
+# does is not turned into vector code.
 @njit(fastmath=True, **SHARED)
-def _link_weights(first, end, stored, weight, powers, links):  # type: ignore[no-untyped-def]
+def _link_weights(first, end, stored, weight, links):  # type: ignore[no-untyped-def]
     """Weigh the links to the neighbours right, below, below right, below left: [IRLS]."""
     _, height, width = stored.shape
-    rest_of, mask = np.float32(2.0**-_POWER_SHIFT), np.uint32((1 << _POWER_SHIFT) - 1)
+    flat, mean = stored.reshape(-1), np.empty(width, np.float32)
     third, floor = np.float32(1 / 3), np.float32(EPSILON * EPSILON)
     for y in range(max(first, GUARD), min(end, height - GUARD)):
-        mean = np.empty(width, np.float32)
         for k in range(4):
             down, aside = min(k, 1), (1, 0, 1, -1)[k]
-            left, right = max(-aside, 0), width - max(aside, 0)
+            left, right = np.uintp(max(-aside, 0)), np.uintp(width - max(aside, 0))
             if down and y == height - GUARD - 1:
                 continue
-            mean[:] = 1
-            for x in range(left, right):
-                s = np.float32(0)
-                for c in range(3):
-                    d = stored[c, y + down, x + aside] - stored[c, y, x]
-                    s += d * d
-                mean[x] = third * s + floor
+            mean[:] = floor
+            for c in range(3):
+                here = np.uintp((c * height + y) * width)
+                there = np.uintp((c * height + y + down) * width + aside)
+                for x in range(left, right):
+                    d = flat[there + x] - flat[here + x]
+                    mean[x] += third * d * d
             # Diagonal links are longer: half the weight.
-            share = weight if k < 2 else weight / 2
+            share, row = weight if k < 2 else weight / 2, links[k, y]
             for x in range(left, right):
-                place = np.uint32(bits_of(mean[x]) - _POWER_FROM)
-                i, rest = place >> np.uint32(_POWER_SHIFT), rest_of * np.float32(place & mask)
-                links[k, y, x] = share * (powers[i] + rest * (powers[i + 1] - powers[i]))
+                row[x] = share * _weight(mean[x])
 
 
 @njit(cache=True, nogil=True, inline='always')

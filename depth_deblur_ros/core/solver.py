@@ -36,8 +36,8 @@ from depth_deblur_ros.core.light import as_colour, light_from_stored, stored_fro
 from depth_deblur_ros.core.likelihood import Pace
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
+from depth_deblur_ros.core.threads import at_most
 from depth_deblur_ros.core.trust import calibrated, OF_LIKELIHOOD, OF_SPECTRA
-import numba
 import numpy as np
 
 SATURATED, EVENLY = 0.98, 0.02  # stored values; how many more pixels a channel may have there
@@ -88,13 +88,19 @@ def _effort(mode: str, *, known: bool) -> Effort | None:
 
 def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort | None) -> Motion:
     """Refine the motion, if it may cost that, and tell a covariance as large as errors are."""
-    if effort is None:
-        return calibrated(found.motion, found.axes, OF_SPECTRA * found.doubt)
+    motion, share = found.motion, OF_SPECTRA
+    if effort is not None:
+        motion = _refined(frame, depth, found, effort)
+        share = OF_LIKELIHOOD[frame.camera.transfer] * effort.doubt
+    blur_px = blur_length(motion.by_rows, depth, frame.camera)
+    return calibrated(motion, found.axes, share * found.doubt, blur_px)
+
+
+def _refined(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort) -> Motion:
+    """Move to where the image is likeliest."""
     light = light_from_stored(frame.image, frame.camera.transfer)
     light = _grey(light, _channels(frame.image))
-    motion = refine(light, depth, frame.camera, found, effort)
-    share = OF_LIKELIHOOD[frame.camera.transfer] * effort.doubt
-    return calibrated(motion, found.axes, share * found.doubt)
+    return refine(light, depth, frame.camera, found, effort)
 
 
 def restore_known(
@@ -175,11 +181,10 @@ def _channels(image: FloatImage) -> FloatImage:
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
     """Run the kernels and OpenCV on this many threads, and give the process back as it was."""
-    kernels, vision = numba.get_num_threads(), cv2.getNumThreads()
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    before = cv2.getNumThreads()
     cv2.setNumThreads(count)
     try:
-        yield
+        with at_most(count):
+            yield
     finally:
-        numba.set_num_threads(kernels)
-        cv2.setNumThreads(vision)
+        cv2.setNumThreads(before)

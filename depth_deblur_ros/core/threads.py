@@ -11,12 +11,13 @@ and what it has not begun when the caller is through, the caller has done itself
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from queue import Empty, SimpleQueue
 from threading import local, Thread
 from typing import Any
 
-from numba import get_num_threads, njit, types
+from numba import config, get_num_threads, njit, set_num_threads, types
 from numba.core.compiler import Compiler
 import numpy as np
 
@@ -105,7 +106,7 @@ class _Worker(Thread):
 
 
 _idle: list[_Worker] = []
-_here = local()  # sharing: whether this thread works on a share
+_here = local()  # sharing: whether this thread works on a share; limit: how many it may use
 
 
 def _worker() -> _Worker:
@@ -133,9 +134,26 @@ def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: 
         _here.sharing = False
 
 
+@contextmanager
+def at_most(threads: int) -> Iterator[None]:
+    """Let `on_threads` and numba use so many threads here, and give the thread back as it was."""
+    before, outer = get_num_threads(), getattr(_here, 'limit', None)
+    limit = min(threads, config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    set_num_threads(limit)
+    _here.limit = limit
+    try:
+        yield
+    finally:
+        set_num_threads(before)
+        _here.limit = outer
+
+
 def threads_here() -> int:
     """Give how many threads `on_threads` may use: one within a share, else as many as numba."""
-    return 1 if getattr(_here, 'sharing', False) else get_num_threads()
+    if getattr(_here, 'sharing', False):
+        return 1
+    # numba takes longer to say than some kernels to run.
+    return getattr(_here, 'limit', None) or get_num_threads()
 
 
 def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:

@@ -15,18 +15,22 @@ import math
 
 import cv2
 from depth_deblur_ros.core.data import FloatImage, Motion, Vector
-from depth_deblur_ros.core.threads import on_threads
+from depth_deblur_ros.core.threads import on_threads, SHARED
+from numba import njit
 import numpy as np
-import numpy.typing as npt
 
 DIRECTIONS = 8
 FURTHER = 3.0  # px of further blur
+STRONG, BINS = 0.1, 8192  # share of the edges that count, and how finely it is found
+RIM = 3  # px around the image, more than half of that
 ENOUGH = 15_000  # pixels or more that are looked at; the ratio is then good to 0.002
 # By scripts/calibrate.py: shares of the covariances that the spectra and the likelihood give, and
-# what no picture tells better of q: two shifts, roll, zoom, two parallaxes [px].
+# what no picture tells better of q: two shifts, roll, zoom, two parallaxes [px]. The last err by
+# a share of the blur, too, as depth does.
 OF_SPECTRA = 0.12
-OF_LIKELIHOOD = {'linear': 0.6, 'srgb': 0.172}
-LEAST_ERROR = (0.07, 0.07, 0.13, 0.05, 0.03, 0.03)
+OF_LIKELIHOOD = {'linear': 0.57, 'srgb': 0.163}
+LEAST_ERROR = (0.07, 0.07, 0.13, 0.05, 0.02, 0.01)
+OF_BLUR = (0, 0, 0, 0, 0.007, 0.003)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,39 +81,64 @@ def sharpness(grey: FloatImage) -> tuple[float, float]:
     """
     smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.6), np.float32)
     step = max(1, math.isqrt(grey.size // ENOUGH))
-    ratios = np.empty(DIRECTIONS)
-
-    def look(first: int, end: int) -> None:
-        for k in range(first, end):
-            angle = math.pi * k / DIRECTIONS
-            near = _difference(smooth, angle, 1.0, step)
-            far = _difference(smooth, angle, FURTHER, step) / np.float32(FURTHER)
-            steep = np.abs(near)
-            strong = steep >= np.percentile(steep, 90)
-            ratios[k] = _rms(near[strong]) / max(_rms(far[strong]), 1e-9)
-
-    on_threads(look, DIRECTIONS)
+    height, width = (-(-side // step) for side in grey.shape)
+    rimmed = cv2.copyMakeBorder(smooth, RIM, RIM, RIM, RIM, cv2.BORDER_REPLICATE)
+    near, far = np.empty((2, DIRECTIONS, height, width), np.float32)
+    on_threads(_compare, DIRECTIONS * height, rimmed, step, 1.0, near)
+    on_threads(_compare, DIRECTIONS * height, rimmed, step, FURTHER, far)
+    ratios = np.empty(DIRECTIONS, np.float32)
+    on_threads(_rate, DIRECTIONS, near, far, ratios)
     return float(ratios.min()), float(ratios.max())
 
 
-def _difference(image: FloatImage, angle: float, length: float, step: int) -> FloatImage:
-    """Give I(x + d/2) - I(x - d/2) at each step-th x, d of this length [px] and angle."""
-    half = 0.5 * length * np.array([math.cos(angle), math.sin(angle)])
-    ahead, behind = (_shifted(image, sign * half, step) for sign in (1, -1))
-    return ahead - behind
+@njit(**SHARED)
+def _rate(first, end, near, far, ratios):  # type: ignore[no-untyped-def]
+    """Compare the root mean squares per px of near and far, over the strongest tenth of near."""
+    for k in range(first, end):
+        steep, wide = near[k].reshape(-1), far[k].reshape(-1)
+        greatest = max(steep.max(), np.float32(1e-9))
+        counts = np.zeros(BINS + 1, np.int64)
+        to_bin = np.float32(BINS) / greatest
+        for i in range(steep.size):
+            counts[np.int64(to_bin * steep[i])] += 1
+        above, least = counts[BINS], BINS
+        while above < STRONG * steep.size:
+            least -= 1
+            above += counts[least]
+        here = there = 0.0
+        for i in range(steep.size):
+            if to_bin * steep[i] >= least:
+                here += steep[i] ** 2
+                there += wide[i] ** 2
+        ratios[k] = math.sqrt(here) / max(math.sqrt(there) / FURTHER, 1e-9)
 
 
-def _shifted(image: FloatImage, shift: npt.NDArray[np.float64], step: int) -> FloatImage:
-    """Give I(x + shift) at each step-th x; borders repeat."""
-    matrix = np.array([[step, 0, shift[0]], [0, step, shift[1]]], np.float32)
-    size = (-(-image.shape[1] // step), -(-image.shape[0] // step))
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    moved = cv2.warpAffine(image, matrix, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(moved, np.float32)
+@njit(cache=True, nogil=True, inline='always')
+def _between(image, y, x, v, u):  # type: ignore[no-untyped-def]
+    """Look up the place (y + v, x + u), whose four pixels are inside."""
+    above = image[y, x] + u * (image[y, x + 1] - image[y, x])
+    below = image[y + 1, x] + u * (image[y + 1, x + 1] - image[y + 1, x])
+    return above + v * (below - above)
 
 
-def _rms(values: FloatImage) -> float:
-    return float(np.sqrt(np.square(values, dtype=np.float64).mean())) if values.size else 0.0
+@njit(**SHARED)
+def _compare(first, end, image, step, length, found):  # type: ignore[no-untyped-def]
+    """Write |I(x + d/2) - I(x - d/2)|, d of one length [px], at each step-th x of I in a rim."""
+    directions, height, width = found.shape
+    for i in range(first, end):
+        k, y = i // height, i % height
+        dx = 0.5 * length * math.cos(math.pi * k / directions)
+        dy = 0.5 * length * math.sin(math.pi * k / directions)
+        left, top = math.floor(dx), math.floor(dy)
+        u, v = np.float32(dx - left), np.float32(dy - top)
+        back, up = math.floor(-dx), math.floor(-dy)
+        s, t = np.float32(-dx - back), np.float32(-dy - up)
+        row = np.uintp(RIM + step * y + top)
+        other = np.uintp(RIM + step * y + up)
+        for x in range(width):
+            ahead = _between(image, row, np.uintp(RIM + step * x + left), v, u)
+            behind = _between(image, other, np.uintp(RIM + step * x + back), t, s)
+            found[k, y, x] = abs(ahead - behind)
 
 
 def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -> Vector:
@@ -125,8 +154,8 @@ def covariance_from_curvature(curvature: Vector, gain: float, prior_px: float) -
     return np.asarray(vectors / values @ vectors.T)
 
 
-def calibrated(motion: Motion, axes: Vector, share: float) -> Motion:
+def calibrated(motion: Motion, axes: Vector, share: float, blur_px: float) -> Motion:
     """Give the motion with a covariance as large as its errors are; axes G, share of the old."""
     own = axes[:6, :6]
-    least = own @ np.diag(np.square(LEAST_ERROR)) @ own.T
+    least = own @ np.diag(np.square(LEAST_ERROR) + np.square(OF_BLUR) * blur_px**2) @ own.T
     return replace(motion, covariance=share * motion.covariance + least)
