@@ -41,10 +41,11 @@ def patch_spectra(
     tops, lefts = np.array(corners).T
     order = np.argsort(lefts, kind='stable')
     columns, first = np.unique(lefts[order], return_index=True)
-    starts, patches = np.append(first, len(order)), np.stack([order, tops[order]], 1)
+    strips = np.stack([columns, first, np.append(first[1:], len(order))], 1)
+    patches = np.stack([order, tops[order]], 1)
     waves, turned, window = _waves()
     told = (_differences(grey) * valid, waves, turned, window, _places(bins), power, weight)
-    on_threads(_look, len(columns), columns, starts, patches, *told)
+    on_threads(_look, len(strips), strips, patches, *told)
     return power, weight
 
 
@@ -111,16 +112,14 @@ def _add_power(across, first, turned, both, power):  # type: ignore[no-untyped-d
 
 
 @njit(**SHARED)
-def _look(
-    first, end, columns, starts, patches, fields, waves, turned, window, bins, power, weight
-):  # type: ignore[no-untyped-def]
+def _look(first, end, strips, patches, fields, waves, turned, window, bins, power, weight):  # type: ignore[no-untyped-def]
     """Look at the patches of some columns."""
     _, height, width = fields.shape
     flat = fields.reshape(-1)
     across, squares = np.empty(2 * height * WAVES, np.float32), np.empty(height, np.float32)
     both, own = np.empty((WAVES, WAVES), np.float32), np.empty((WAVES, BAND_COLUMNS), np.float32)
     for c in range(first, end):
-        left = columns[c]
+        left, own_first, own_end = strips[c]
         for y in range(0, 2 * height, 2):
             p = y * width + left
             _combine(flat, p, p + width, waves, 0, across, y * WAVES, (y + 1) * WAVES)
@@ -129,7 +128,7 @@ def _look(
             for y in range(height):
                 for k in range(PATCH):
                     squares[y] += fields[f, y, left + k] ** 2 * window[k]
-        for i in range(starts[c], starts[c + 1]):
+        for i in range(own_first, own_end):
             b, top = patches[i]
             own[:] = 0
             for f in range(2):
