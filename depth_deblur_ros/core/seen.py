@@ -78,38 +78,53 @@ def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> F
 def _see(first, end, nearness, ray, motion, flow, seen):  # type: ignore[no-untyped-def]
     """Warp the inverse depth (H, W) to some instants; seen (H, N, W or more) is written."""
     height, width = nearness.shape
-    samples = seen.shape[1]
+    samples, one = seen.shape[1], np.uintp(1)
+    places, values = np.empty(width, np.int32), np.empty(width, np.float32)
+    across = np.arange(1, width + 1).astype(np.float32)
+    # Cell (y, x) of the four pixels from (y - 1, x - 1) on: its nearest surface.
+    cells = np.empty((height + 1, width + 1), np.float32)
+    view = np.empty((height, width), np.float32)
     for i in range(first, end):
         t = np.float32((i + 0.5) / samples - 0.5)
-        # Cell (y, x) of the four pixels from (y - 1, x - 1) on: its nearest surface.
-        cells = np.zeros((height + 1, width + 1), np.float32)
+        cells[:] = 0
         for y in range(height):
-            _mark_row(y, t, nearness, ray, motion, flow, cells)
-        view = np.empty((height, width), np.float32)
+            _place_row(y, t, nearness, ray, motion, flow, across, places, values)
+            _mark(places, values, cells.reshape(-1))
         for y in range(height):
-            above, below = cells[y], cells[y + 1]
-            for x in range(width):
-                view[y, x] = max(above[x], above[x + 1], below[x], below[x + 1])
+            above, below, own = cells[y], cells[y + 1], view[y]
+            for x in range(np.uintp(0), np.uintp(width)):
+                own[x] = max(above[x], above[x + one], below[x], below[x + one])
         _fill_uncovered(view, nearness)
         for y in range(height):
-            for x in range(seen.shape[2]):
-                seen[y, i, x] = view[y, min(x, width - 1)]
+            seen[y, i, :width] = view[y]
+            seen[y, i, width:] = view[y, width - 1]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _mark_row(y, t, nearness, ray, motion, flow, cells):  # type: ignore[no-untyped-def]
-    """Move the points of one row and leave each in the cell where it comes to stand."""
-    high, wide = np.float32(cells.shape[0]), np.float32(cells.shape[1])
-    one, least = np.float32(1), np.float32(LEAST_GROWTH)
-    roll = one + t * motion[0] * ray[nearness.shape[1] + y]
-    for x in range(nearness.shape[1]):
-        w = nearness[y, x]
+def _place_row(y, t, nearness, ray, motion, flow, across, places, values):  # type: ignore[no-untyped-def]
+    """Say for each point of a row in which cell, 0 if in none, and how near it comes to stand."""
+    height, width = nearness.shape
+    high, wide = np.float32(height + 1), np.float32(width + 1)
+    one, least, zero = np.float32(1), np.float32(LEAST_GROWTH), np.float32(0)
+    roll, row = one + t * motion[0] * ray[width + y], np.float32(y + 1)
+    near, ax, ay, bx, by = nearness[y], flow[y, 0], flow[y, 1], flow[y, 2], flow[y, 3]
+    for x in range(np.uintp(0), np.uintp(width)):
+        w = near[x]
         growth = roll + t * (motion[5] * w - motion[1] * ray[x])
-        px = np.float32(x + 1) + t * (flow[y, 0, x] + w * flow[y, 2, x])
-        py = np.float32(y + 1) + t * (flow[y, 1, x] + w * flow[y, 3, x])
-        if 0 <= px < wide and 0 <= py < high:
-            row, column = np.uint32(py), np.uint32(px)
-            cells[row, column] = max(cells[row, column], w / max(growth, least))
+        px = across[x] + t * (ax[x] + w * bx[x])
+        py = row + t * (ay[x] + w * by[x])
+        inside = (px >= zero) & (px < wide) & (py >= zero) & (py < high)
+        place = np.int32(py) * np.int32(width + 1) + np.int32(px)
+        places[x] = place if inside else np.int32(0)
+        values[x] = w / max(growth, least) if inside else zero
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _mark(places, values, cells):  # type: ignore[no-untyped-def]
+    """Leave in each cell the nearest of the points there."""
+    for k in range(len(places)):
+        place = np.uint32(places[k])
+        cells[place] = max(cells[place], values[k])
 
 
 @njit(cache=True, nogil=True, inline='always')
