@@ -118,3 +118,19 @@ def test_the_adjoint_of_the_test_is_the_operator(converged):
     high, wide, _ = found.blur.latent_shape
     found.blur.latent_part(planes)[0] = inner.reshape(high, wide)
     np.testing.assert_allclose(a @ planes[0].ravel(), matrix @ inner, atol=1e-4)
+
+
+def test_sums_over_links_are_those_of_the_matrix():
+    """x' R x by rows, and noise whose covariance is R."""
+    found = posterior(part(TINY, 0.5 * TRUTH), np.pad(0.5 * TRUTH, (0, 3)))
+    problem, rng = found.problem, np.random.default_rng(0)
+    x = found.latent + rng.standard_normal(found.latent.shape, np.float32)
+    none = np.zeros_like(problem.trust)
+    expected = [
+        -float(np.vdot(plane, r)) for plane, r in zip(x, problem.slope(none, x), strict=True)
+    ]
+    told = likelihood._roughness(problem, x) * x[0].size
+    np.testing.assert_allclose(told, expected, rtol=1e-4)
+    noise = [likelihood._prior_noise(problem, seed).astype(np.float64) for seed in range(200)]
+    told = np.mean([np.sum(n * x[:2], (1, 2)) ** 2 for n in noise])
+    assert told == pytest.approx(np.mean(expected[:2]), rel=0.3)

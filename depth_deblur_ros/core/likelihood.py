@@ -28,7 +28,9 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError,
 from depth_deblur_ros.core.light import light_slope, stored_from_light
 from depth_deblur_ros.core.motion import blur_and_slope
 from depth_deblur_ros.core.quadratic import conjugate_gradients, Quadratic, reweighted
+from depth_deblur_ros.core.sums import add_noise, multiply, squares, sum_up
 from depth_deblur_ros.core.sweep import Sweep
+from depth_deblur_ros.core.threads import on_threads
 import numpy as np
 
 REWEIGHTINGS = 4  # of the image step
@@ -41,10 +43,7 @@ LEAST_COUNT = 1e-4
 # Least sigma: 8 bit rounding for averaged values; a real camera hides its noise, and more is
 # unexplained there.
 SIGMA_LEAST, SIGMA_MOST = {'linear': 5e-4, 'srgb': 0.012}, 0.1
-OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # of the links, in rows and columns
 AROUND = 64  # px of noise beyond a part of the frame, so that its margin may change
-
-Places = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -164,11 +163,9 @@ def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: Float
 
 def _roughness(problem: Quadratic, latent: FloatImage) -> Vector:
     """Give x' R x per pixel of each plane (3,)."""
-    total = np.zeros(3)
-    for k, (here, there) in enumerate(_ends(latent.shape[1:])):
-        square = np.square(latent[(slice(None), *there)] - latent[(slice(None), *here)])
-        total += np.tensordot(square, _link(problem, k, here, there), 2)
-    return np.asarray(total / latent[0].size)
+    sums = np.empty((latent.shape[1], 3))
+    on_threads(squares, len(sums), latent, problem.links, problem.ease[0], sums)
+    return np.asarray(sums.sum(0) / latent[0].size)
 
 
 def _prior_noise(problem: Quadratic, seed: int) -> FloatImage:
@@ -179,10 +176,7 @@ def _prior_noise(problem: Quadratic, seed: int) -> FloatImage:
     first = max(AROUND - room, 0)
     noise = _link_noise(seed, max(height - 2 * room + 2 * AROUND, height), width + 2 * AROUND)
     noise = noise[:, :, first : first + height, first : first + width]
-    for k, (here, there) in enumerate(_ends((height, width))):
-        n = np.sqrt(_link(problem, k, here, there)) * noise[(k, slice(None), *here)]
-        out[(slice(None), *here)] += n
-        out[(slice(None), *there)] -= n
+    add_noise(noise, problem.links, problem.ease[0], out)
     return out
 
 
@@ -203,22 +197,6 @@ def _noise(seed: int, height: int, width: int) -> FloatImage:
     return rng.standard_normal((5, 2, height, -(-width // 128) * 128), np.float32)
 
 
-def _ends(shape: tuple[int, ...]) -> list[tuple[Places, Places]]:
-    """Give the places from which the links of each offset start, and where they end."""
-    height, width = shape
-    places = []
-    for down, aside in OFFSETS:
-        left, right = max(-aside, 0), width - max(aside, 0)
-        here = (slice(0, height - down), slice(left, right))
-        places.append((here, (slice(down, height), slice(left + aside, right + aside))))
-    return places
-
-
-def _link(problem: Quadratic, k: int, here: Places, there: Places) -> FloatImage:
-    ease = problem.ease[0]
-    return np.asarray(problem.links[k][here] * np.minimum(ease[here], ease[there]))
-
-
 def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
     """Give g (9,), (16), and J mu (H, W, 9), by rows."""
     blur, part = found.blur, found.part
@@ -226,8 +204,8 @@ def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
     missing, slope = blur_and_slope(blur.motion[:6].astype(np.float64), latent, blur)
     missing[..., 0] -= part.light
     missing *= part.trust[..., None] * np.array([1, 0.5, 0.5], np.float32)
-    # einsum, not BLAS, whose threads spin for long after such short work.
-    g = np.einsum('ynk,yn->yk', _flat(slope), _flat(missing), dtype=np.float64)
+    g = np.empty((len(slope), 6))
+    on_threads(sum_up, len(g), _flat(slope), _flat(missing), g)
     yn = blur.ray[-len(g) :].astype(np.float64)
     force = np.concatenate([g.sum(0), yn @ g[:, :3]]) / part.scales.sigma**2
     own = slope[..., 0, :]
@@ -254,5 +232,7 @@ def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
     yn = found.blur.ray[-len(rest) :, None, None]
     rest[..., 6:] = yn * rest[..., :3]
     weighted = found.part.trust[..., None] * slope
-    h = np.einsum('ni,nj->ij', weighted.reshape(-1, 9), rest.reshape(-1, 9), dtype=np.float64)
+    sums = np.empty((len(rest), 9, 9))
+    on_threads(multiply, len(sums), weighted, rest, sums)
+    h = sums.sum(0)
     return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2
