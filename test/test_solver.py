@@ -100,6 +100,20 @@ def small_result(small_frame):
     return deblur(small_frame)
 
 
+def test_a_refinement_that_the_bands_do_not_confirm_is_not_taken(small_frame, monkeypatch):
+    def astray(light, depth, camera, start, effort):
+        return Motion.from_vector(1.6 * start.motion.vector, 1e-12 * np.eye(6))
+
+    params = SolverParams(mode='motion')
+    unrefined = deblur(small_frame, params, start=deblur(small_frame, params).motion)
+    monkeypatch.setattr(solver, 'refine', astray)
+    kept = deblur(small_frame, params)
+    assert kept.outcome is Outcome.SOLVED
+    assert kept.blur_px == pytest.approx(10, abs=0.7)
+    least = np.diag(unrefined.motion.covariance) / 2
+    assert (np.diag(kept.motion.covariance) > least).all()
+
+
 def psnr(image, truth):
     return -10 * math.log10(float(np.mean((image - truth) ** 2)))
 

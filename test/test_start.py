@@ -156,6 +156,15 @@ def test_rows_that_see_different_turns_do_not_bend_the_motion(rolling):
     assert flow_error(found, true) < 0.6
 
 
+def test_bands_explain_what_is_near_and_nothing_else():
+    true = sideways(12, 0.4)
+    found = blind_start(swept(texture(1), 12, 0.4, 0.005), DEPTH, CAMERA)
+    assert found.explains(found.motion)
+    assert found.explains(true)
+    for other in (sideways(12, 1.2), sideways(18, 0.4), sideways(6, 0.4)):
+        assert not found.explains(other)
+
+
 class Said:
     """A scale whose score of any motion is given."""
 

@@ -4,8 +4,8 @@ The page that tells the algorithm: from one blurred RGB-D frame to the sharp ima
 1 fill the depth map's holes, guided by the colours (depth.py)
 2 find the motion from the bands that it leaves in the spectra, coarse and fine (start.py), or
   find that there is no blur or nothing to trust: then the frame passes unchanged
-3 move on to where the image itself is likeliest (joint.py): in mode full, and at the first frame
-  in the others
+3 move on to where the image itself is likeliest (joint.py), unless the bands say otherwise: in
+  mode full, and at the first frame in the others
 4 restore the image under that motion (latent.py), near things passing before far ones (blur.py)
 
 With `method` paper, 2 to 4 are the paper's: alternation.py.
@@ -73,7 +73,7 @@ def deblur(
         found = blind_start(grey, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
             effort = _effort(params.mode, known=start is not None)
-            found = replace(found, motion=_settled(frame, depth, found, effort))
+            found = replace(found, motion=_settled(frame, depth, found, effort), scales=())
         return _finish(frame, depth, found, params, began)
 
 
@@ -90,8 +90,9 @@ def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort |
     """Refine the motion, if it may cost that, and tell a covariance as large as errors are."""
     motion, share = found.motion, OF_SPECTRA
     if effort is not None:
-        motion = _refined(frame, depth, found, effort)
-        share = OF_LIKELIHOOD[frame.camera.transfer] * effort.doubt
+        refined = _refined(frame, depth, found, effort)
+        if found.explains(refined):
+            motion, share = refined, OF_LIKELIHOOD[frame.camera.transfer] * effort.doubt
     blur_px = blur_length(motion.by_rows, depth, frame.camera)
     return calibrated(motion, found.axes, share * found.doubt, blur_px)
 

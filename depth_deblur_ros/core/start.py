@@ -10,7 +10,7 @@ blur [px].
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import math
 
@@ -63,6 +63,7 @@ SMEARED, SMEAR = 1.005, 8.0  # edges that no blur below so many px leaves
 BELIEF = 0.4  # common -S at which a motion is taken for certain
 # Where the full scale is the only one, what has less quality is wrong one time in four: variance.
 LONELY, LONELY_DOUBT = 0.45, 25.0
+KEPT = 0.85  # share of -S that a motion keeps which still explains the bands (0.88 and more do)
 OBSERVATIONS = 400.0  # that S^2 is worth (covariance), calibrated on cases with known truth
 PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
 
@@ -70,7 +71,7 @@ PRIOR_PX = 40.0  # px, standard deviation of q where the image tells nothing
 @dataclass(frozen=True, eq=False)
 class Start:
     """
-    The first motion (zero unless solved), what it is worth, and axes G.
+    The first motion (zero unless solved), what it is worth, axes G and the scales that say so.
 
     spread (9, 9): covariance of the motion by rows, if it is the right one; doubt: how many times
     larger, as shallow bands err more and it may be another.
@@ -82,6 +83,14 @@ class Start:
     axes: Vector = field(default_factory=lambda: np.eye(9))
     spread: Vector = field(default_factory=lambda: np.zeros((9, 9)))
     doubt: float = 1.0
+    scales: Sequence[Scale] = ()
+
+    def explains(self, motion: Motion) -> bool:
+        """Tell whether the bands are about as deep at another motion as at this one."""
+        both = np.stack([self.motion.by_rows, motion.by_rows], 1)
+        qs = np.asarray(np.linalg.solve(self.axes, both).T, np.float64)
+        here, there = common_score(qs, list(self.scales))
+        return bool(there <= KEPT * here)
 
 
 def blind_start(
@@ -130,7 +139,7 @@ def blind_start(
     if scales[-1].factor == CLOSE:
         q = q * math.sqrt(1 - (CLOSE_BIAS / length(q)) ** 2)
     motion = Motion.from_vector(axes @ q, covariance[:6, :6])
-    return Start(motion, Outcome.SOLVED, quality, axes, covariance, doubt)
+    return Start(motion, Outcome.SOLVED, quality, axes, covariance, doubt, scales)
 
 
 def _without_motion(edges: Edges, seen: float, *, alone: bool) -> Outcome:
