@@ -25,25 +25,16 @@ from pathlib import Path
 
 import cv2
 from depth_deblur_ros.core.data import DeblurResult, FloatImage, Motion, Outcome, RgbdFrame
-from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
-from depth_deblur_ros.folders import read_depth, read_rgb
+from depth_deblur_ros.folders import read_frame
 from depth_deblur_ros.misfit import energies_of
-from depth_deblur_ros.tum import tum_camera, tum_pairs, TumPair
+from depth_deblur_ros.tum import tum_pairs, TumPair
 import numpy as np
 
 SURROUNDINGS, SMOOTH, FLAT = 4.0, 3.0, 30  # px, px, percent
 FOUND = 'as found'
 Witnesses = dict[str, tuple[float, float]]
-
-
-def read_pair(folder: Path, pair: TumPair) -> RgbdFrame:
-    """Read the pictures of a pair, without the lens's distortion."""
-    file = tum_camera(folder)
-    colour = read_rgb(pair.rgb, file.intrinsics)
-    depth = read_depth(pair.depth, file.depth_scale, file.intrinsics)
-    return undistorted(RgbdFrame(colour, depth, file.intrinsics))
 
 
 def wrong_motions(motion: Motion) -> Mapping[str, Motion]:
@@ -74,7 +65,8 @@ def _detail(grey: FloatImage) -> FloatImage:
 
 def asked(pair: TumPair, folder: Path) -> tuple[Outcome, float, Witnesses]:
     """Solve a frame; its outcome, its quality and what the witnesses say of each motion."""
-    frame, params = read_pair(folder, pair), SolverParams(threads=1)
+    frame = read_frame(pair.rgb, pair.depth, folder / 'camera.json')
+    params = SolverParams(threads=1)
     result = deblur(frame, params)
     if result.outcome is not Outcome.SOLVED:
         return result.outcome, result.quality, {}

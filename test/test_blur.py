@@ -1,16 +1,14 @@
 """The blur operator: exact cases, its adjoint, the slow twins."""
 
-from contextlib import contextmanager
-
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator, MAX_SAMPLES, MIN_SAMPLES
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.geometry import flow, normalised_grid
 from depth_deblur_ros.core.instants import FEWEST
 from depth_deblur_ros.core.seen import _fill_uncovered, _see, MIN_INVERSE_DEPTH
 from depth_deblur_ros.core.sweep import MANY
+from depth_deblur_ros.core.threads import at_most
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import config, get_num_threads, set_num_threads
 import numpy as np
 import oracle
 import pytest
@@ -21,16 +19,6 @@ TOL = 2e-5
 seeds = st.integers(0, 2**32 - 1)
 threads = st.sampled_from([1, 2])
 few = settings(max_examples=25)
-
-
-@contextmanager
-def on_threads(count):
-    before = get_num_threads()
-    set_num_threads(min(count, config.NUMBA_NUM_THREADS))
-    try:
-        yield
-    finally:
-        set_num_threads(before)
 
 
 def steps_in_depth(rng, shape):
@@ -157,7 +145,7 @@ def test_apply_and_adjoint_agree(drawn, count, kind, tolerance):
     blur, rng = drawn
     latent = rng.random(blur.latent_shape).astype(kind) - kind(0.5)
     image = rng.random((*blur.inverse_depth.shape[:2], 3)).astype(kind) - kind(0.5)
-    with on_threads(count):
+    with at_most(count):
         there, back = blur.apply(latent), blur.adjoint(image)
     assert (there.dtype, back.dtype) == (kind, kind)
     assert (there.shape, back.shape) == (image.shape, latent.shape)
@@ -173,7 +161,7 @@ def test_apply_and_adjoint_are_their_slow_twins(drawn, count):
     matrix = oracle.blur_matrix(blur)
     latent = rng.random(blur.latent_shape, np.float32)
     image = rng.random((*blur.inverse_depth.shape[:2], 3), np.float32)
-    with on_threads(count):
+    with at_most(count):
         there, back = blur.apply(latent), blur.adjoint(image)
     np.testing.assert_allclose(there, oracle.through(matrix, latent, image.shape), atol=TOL)
     slow = oracle.through(matrix.T, image, latent.shape)
@@ -210,7 +198,7 @@ def test_a_thinned_operator_is_its_slow_twin(seed, spacing, count):
     sweep = blur.thinned(spacing)
     planes, taken = np.zeros(sweep.latent_shape, np.float32), sweep.blurred_planes(image)
     blur.latent_part(planes)[:] = np.moveaxis(latent, 2, 0)
-    with on_threads(count):
+    with at_most(count):
         there, back = sweep.gather(planes, np.ones_like(taken)), sweep.adjoint(taken)
     slow = oracle.through(matrix, latent, image.shape)
     np.testing.assert_allclose(np.moveaxis(there, 0, 2), slow, atol=TOL)
@@ -255,7 +243,7 @@ def test_a_board_that_comes_close_stays_within_the_strips(count):
     assert np.abs(oracle.displacements(blur)).max() <= blur.margin - 1
     rng = np.random.default_rng(0)
     latent, image = rng.random(blur.latent_shape), rng.random((48, 64, 3))
-    with on_threads(count):
+    with at_most(count):
         left, right = np.vdot(blur.apply(latent), image), np.vdot(latent, blur.adjoint(image))
     assert left == pytest.approx(right, rel=1e-6)
 
@@ -312,7 +300,7 @@ def test_threads_share_one_row_or_none():
     motion = np.array([0, 0.1, 0, 0, 0, 0, 30, 30, 0, 0, 0], np.float32)
     blur = BlurOperator(ray, motion, seen, 4)
     image = rng.random((3, 40, 3), np.float32)
-    with on_threads(1):
+    with at_most(1):
         alone = blur.adjoint(image)
-    with on_threads(2):
+    with at_most(2):
         np.testing.assert_allclose(blur.adjoint(image), alone, atol=1e-6)

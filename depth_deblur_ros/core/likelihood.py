@@ -28,7 +28,7 @@ from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError,
 from depth_deblur_ros.core.light import light_slope, stored_from_light
 from depth_deblur_ros.core.motion import blur_and_slope
 from depth_deblur_ros.core.quadratic import conjugate_gradients, Quadratic, reweighted
-from depth_deblur_ros.core.sums import add_noise, multiply, squares, sum_up
+from depth_deblur_ros.core.sums import add_noise, multiply, squares
 from depth_deblur_ros.core.sweep import Sweep
 from depth_deblur_ros.core.threads import on_threads
 import numpy as np
@@ -204,8 +204,7 @@ def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
     missing, slope = blur_and_slope(blur.motion[:6].astype(np.float64), latent, blur)
     missing[..., 0] -= part.light
     missing *= part.trust[..., None] * np.array([1, 0.5, 0.5], np.float32)
-    g = np.empty((len(slope), 6))
-    on_threads(sum_up, len(g), _flat(slope), _flat(missing), g)
+    g = _products(_flat(missing)[..., None], _flat(slope))[:, 0]
     yn = blur.ray[-len(g) :].astype(np.float64)
     force = np.concatenate([g.sum(0), yn @ g[:, :3]]) / part.scales.sigma**2
     own = slope[..., 0, :]
@@ -215,6 +214,13 @@ def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
 def _flat(rows: FloatImage) -> FloatImage:
     """Give (H, W, 3, ...) as (H, 3 W, ...)."""
     return rows.reshape(len(rows), -1, *rows.shape[3:])
+
+
+def _products(left: FloatImage, right: FloatImage) -> Vector:
+    """Sum the outer products of left (H, n, I) and right (H, n, J) over each row: (H, I, J)."""
+    sums = np.empty((len(left), left.shape[2], right.shape[2]))
+    on_threads(multiply, len(sums), left, right, sums)
+    return sums
 
 
 def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
@@ -232,7 +238,5 @@ def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
     yn = found.blur.ray[-len(rest) :, None, None]
     rest[..., 6:] = yn * rest[..., :3]
     weighted = found.part.trust[..., None] * slope
-    sums = np.empty((len(rest), 9, 9))
-    on_threads(multiply, len(sums), weighted, rest, sums)
-    h = sums.sum(0)
+    h = _products(weighted, rest).sum(0)
     return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2

@@ -66,25 +66,14 @@ def add_noise(noise, links, ease, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**SHARED)
-def sum_up(first, end, slopes, weights, sums):  # type: ignore[no-untyped-def]
-    """Sum slopes (H, n, K) with weights (H, n) over each row: (H, K)."""
-    _, count, size = slopes.shape
-    for y in range(first, end):
-        sums[y] = 0
-        for n in range(count):
-            weight = np.float64(weights[y, n])
-            for k in range(size):
-                sums[y, k] += weight * slopes[y, n, k]
-
-
-@njit(**SHARED)
 def multiply(first, end, left, right, sums):  # type: ignore[no-untyped-def]
-    """Sum the outer products of left and right (H, W, K) over each row: (H, K, K)."""
-    _, count, size = left.shape
+    """Sum the outer products of left (H, n, I) and right (H, n, J) over each row: (H, I, J)."""
+    _, count, high = left.shape
+    wide = right.shape[2]
     for y in range(first, end):
         sums[y] = 0
         for n in range(count):
-            for i in range(size):
+            for i in range(high):
                 one = np.float64(left[y, n, i])
-                for j in range(size):
+                for j in range(wide):
                     sums[y, i, j] += one * right[y, n, j]
