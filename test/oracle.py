@@ -53,20 +53,20 @@ def fill_uncovered(view, nearness):
 
 def displacements(blur):
     """Give (dx, dy), (H, W, N) each: how far [px] from its own place each pixel reads at t_i."""
-    flow_x, flow_y = flows(blur)
+    flow_x, flow_y = flows(blur, kept(blur))
     t = instants(flow_x.shape[2])
     return -t * flow_x, -t * flow_y
 
 
 def thinned_displacements(blur, spacing):
     """Give as `displacements`, each block of 16 columns at instants of its own, and weights."""
-    flow_x, flow_y = flows(blur)
+    flow_x, flow_y = flows(blur, kept(blur))
+    lengths = np.hypot(*flows(blur, blur.inverse_depth.astype(np.float64)))
     height, width, samples = flow_x.shape
     places, weights = np.zeros((2, height, width, samples)), np.zeros(flow_x.shape)
     for y, left in np.ndindex(height, width // 16):
         block = np.s_[y, 16 * left : 16 * left + 16]
-        longest = np.hypot(flow_x[block], flow_y[block]).max()
-        count = int(np.clip(np.ceil(longest / spacing), 3, samples))
+        count = int(np.clip(np.ceil(lengths[block].max() / spacing), 3, samples))
         for i, t in enumerate(instants(count)):
             seen = int((i + 0.5) * samples / count)
             places[(0, *block, i)] = -t * flow_x[(*block, seen)]
@@ -75,17 +75,24 @@ def thinned_displacements(blur, spacing):
     return *places, weights
 
 
-def flows(blur):
-    """Give the flow (x, y), (H, W, N) each, of what each pixel sees at each instant [px]."""
+def flows(blur, w):
+    """Give the flow (x, y), (H, W, N) each [px], of inverse depth w (H, W, N)."""
     width = blur.inverse_depth.shape[1]
     vx, vy, vz, fx, fy = blur.motion[3:8].astype(np.float64)
     ray = blur.ray.astype(np.float64)
     xn, yn = ray[None, :width, None], ray[width:, None, None]
     tx, ty, tz = (blur.motion[k] + yn * blur.motion[8 + k] for k in range(3))
-    w = blur.inverse_depth.astype(np.float64)
     flow_x = fx * (-xn * yn * tx + (1 + xn**2) * ty - yn * tz + w * (vx - xn * vz))
     flow_y = fy * (-(1 + yn**2) * tx + xn * yn * ty + xn * tz + w * (vy - yn * vz))
     return flow_x, flow_y
+
+
+def kept(blur):
+    """Give the inverse depth (H, W, N) as blocks keep it: in whole parts of the nearest, 65535."""
+    height, width, samples = blur.inverse_depth.shape
+    blocks = np.moveaxis(blur.sweep.layout.nearness, 2, 1).reshape(height, samples, -1)
+    parts = np.moveaxis(blocks[..., :width], 1, 2).astype(np.float64)
+    return parts * (blur.inverse_depth.max() / 65535)
 
 
 def blur_matrix(blur):

@@ -3,9 +3,8 @@
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator, MAX_SAMPLES, MIN_SAMPLES
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.geometry import flow, normalised_grid
-from depth_deblur_ros.core.instants import FEWEST
-from depth_deblur_ros.core.seen import _fill_uncovered, _see, MIN_INVERSE_DEPTH
-from depth_deblur_ros.core.sweep import MANY
+from depth_deblur_ros.core.instants import APART, FEWEST, MANY
+from depth_deblur_ros.core.seen import _fill_uncovered, _see, MIN_INVERSE_DEPTH, ROW
 from depth_deblur_ros.core.threads import at_most
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -174,7 +173,7 @@ def test_blocks_that_read_far_apart_are_their_slow_twins():
     depth = np.full((48, 64), 20, np.float32)
     depth[10:30, 20:43] = 1
     blur = blur_operator(Motion(np.zeros(3), [20 / 64, 18 / 64, 0.05]), depth, CAMERA)
-    offsets = blur.sweep.cells[..., 2] * blur.sweep.cells[..., 3]
+    offsets = blur.sweep.layout.cells[..., 2] * blur.sweep.layout.cells[..., 3]
     assert (offsets == 4).any()
     assert ((offsets > 4) & (offsets <= MANY)).any()
     assert (offsets > MANY).any()
@@ -184,6 +183,19 @@ def test_blocks_that_read_far_apart_are_their_slow_twins():
     np.testing.assert_allclose(there, oracle.through(matrix, latent, image.shape), atol=TOL)
     slow = oracle.through(matrix.T, image, latent.shape)
     np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
+
+
+@pytest.mark.parametrize('v', [[16, 3, 0], [3, 6, 2], [6, 6, -1], [0, 0, 5]])
+def test_pixels_that_would_read_beyond_the_latent_image_read_its_rim(v):
+    rng = np.random.default_rng(0)
+    blur = blur_operator(Motion([0.01, 0.02, 0.3], v), steps_in_depth(rng, (48, 64)), CAMERA)
+    assert (blur.sweep.layout.cells == APART).any()
+    matrix = oracle.blur_matrix(blur)
+    latent, image = rng.random(blur.latent_shape, np.float32), rng.random((48, 64, 3), np.float32)
+    slow = oracle.through(matrix, latent, image.shape)
+    np.testing.assert_allclose(blur.apply(latent), slow, atol=TOL)
+    slow = oracle.through(matrix.T, image, latent.shape)
+    np.testing.assert_allclose(blur.adjoint(image), slow, atol=TOL * max(1, float(slow.max())))
 
 
 @given(seed=seeds, spacing=st.floats(0.3, 4), count=threads)
@@ -207,6 +219,15 @@ def test_a_thinned_operator_is_its_slow_twin(seed, spacing, count):
     np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
 
 
+@given(drawn=blurs())
+@few
+def test_blocks_keep_nearness_to_half_a_part_in_65535_of_the_nearest(drawn):
+    blur, _ = drawn
+    seen = blur.inverse_depth
+    parts = (oracle.kept(blur) - seen) / (seen.max() / 65535)
+    assert np.abs(parts).max() < 0.51  # float32 tells 1 / 256 of the largest of them
+
+
 def test_an_operator_forgets_what_it_was_used_for():
     """Its room for results is used again and again."""
     rng, blur = np.random.default_rng(0), shift(9 / 32, 7 / 32)
@@ -219,11 +240,11 @@ def test_a_block_has_as_many_instants_as_its_own_blur_is_long():
     depth = np.full((48, 64), 20, np.float32)
     depth[:, 40:56] = 1.0
     blur = blur_operator(Motion(np.zeros(3), [20 / 64, 0, 0]), depth, CAMERA)  # 20 px and 1 px
-    counts = np.rint(1 / blur.thinned(0.8).shares)
+    counts = np.rint(1 / blur.thinned(0.8).layout.shares)
     assert (counts[:, 0] == FEWEST).all()
     assert (counts[:, 2:] == 20).all()
-    assert (np.rint(1 / blur.thinned(2.0).shares)[:, 2] == 10).all()
-    assert (np.rint(1 / blur.sweep.shares) == 20).all()
+    assert (np.rint(1 / blur.thinned(2.0).layout.shares)[:, 2] == 10).all()
+    assert (np.rint(1 / blur.sweep.layout.shares) == 20).all()
 
 
 @given(drawn=blurs())
@@ -256,10 +277,13 @@ def test_what_is_seen_is_its_slow_twin(seed, samples):
     nearness = 1 / steps_in_depth(rng, (14, 16))[:height, :width].astype(np.float64)
     motion = rng.normal(0, 0.2, 8)
     ray = np.concatenate([np.linspace(-0.6, 0.5, width), np.linspace(-0.4, 0.5, height)])
-    parts = rng.normal(0, 3, (1, 4, 1)) + rng.normal(0, 0.01, (height, 4, width))
-    f = np.stack([parts[:, k] + nearness * parts[:, k + 2] for k in (0, 1)], -1)
+    rows = rng.normal(0, 3, (height, ROW))
+    xn, (a, ax, axx, c, cx, b, bx, d) = ray[:width], rows.T[..., None]
+    across = a + ax * xn + axx * xn**2 + nearness * (b + bx * xn)
+    f = np.stack([across, c + cx * xn + nearness * d], -1)
     seen = np.empty((height, samples, width + 3))
-    _see(0, samples, nearness, ray, motion, parts, seen)
+    flow_numbers = np.concatenate([np.pad(xn, (0, 3), 'edge'), rows.ravel()])
+    _see(0, samples, nearness, ray, motion, flow_numbers, seen)
     slow = oracle.seen(nearness, ray, motion, f, samples)
     np.testing.assert_allclose(np.moveaxis(seen[..., :width], 1, 2), slow, rtol=1e-6)
     assert (seen[..., width:] == seen[..., width - 1 : width]).all()

@@ -20,7 +20,7 @@ import math
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion
 from depth_deblur_ros.core.instants import flow_at
 from depth_deblur_ros.core.lanes import greatest, larger, load, splat, whole_blocks, WIDTH
-from depth_deblur_ros.core.seen import flow_parts, nearness_of, pack, seen_by_pixel, seen_planes
+from depth_deblur_ros.core.seen import flow_rows, nearness_of, pack, seen_by_pixel, seen_planes
 from depth_deblur_ros.core.sweep import Sweep, sweep_of
 from depth_deblur_ros.core.threads import on_threads, SHARED, threads_here
 from numba import njit
@@ -46,7 +46,6 @@ class BlurOperator:
     motion: npt.NDArray[np.float32]  # (11,): theta, v, fx, fy, rolling
     inverse_depth: FloatImage  # (H, W, N) seen at each instant [1/m]
     margin: int
-    parts: FloatImage | None = None  # flow_parts, if known
 
     @property
     def _shape(self) -> tuple[int, int, int]:
@@ -69,9 +68,7 @@ class BlurOperator:
         seen = np.moveaxis(self.inverse_depth, 2, 1)
         if width < whole_blocks(width):
             seen = np.pad(seen, [(0, 0), (0, 0), (0, whole_blocks(width) - width)], 'edge')
-        flow = self.parts
-        if flow is None:
-            flow = flow_parts(self.ray, self.motion, (height, width))
+        flow = flow_rows(self.ray, self.motion, (height, width))
         return sweep_of(np.ascontiguousarray(seen), flow, self.margin, spacing)
 
     def apply(self, latent: FloatImage) -> FloatImage:
@@ -139,16 +136,16 @@ def blur_operator(
     spacing: px of the longest blur from one instant to the next, where the limits allow it.
     """
     ray, packed = pack(motion, camera)
-    flow = flow_parts(ray, packed, depth.shape)
+    flow = flow_rows(ray, packed, depth.shape)
     near = nearness_of(depth)
-    blocks = np.pad(near, [(0, 0), (0, flow.shape[2] - camera.width)], 'edge')
+    blocks = np.pad(near, [(0, 0), (0, whole_blocks(camera.width) - camera.width)], 'edge')
     longest = math.sqrt(_largest(blocks[:, None], flow)[2])
     least = math.ceil(MIN_SAMPLES / spacing)
     samples = int(np.clip(math.ceil(longest / spacing - ROUNDING), least, MAX_SAMPLES))
     seen = seen_planes(near, ray, packed, flow, samples)
     reach = max(_largest(seen, flow)[:2]) / 2
     margin = math.ceil(min(reach, max(camera.width, camera.height))) + 2  # 2: interpolation
-    return BlurOperator(ray, packed, seen_by_pixel(seen, camera.width), margin, flow)
+    return BlurOperator(ray, packed, seen_by_pixel(seen, camera.width), margin)
 
 
 def _largest(nearness: FloatImage, flow: FloatImage) -> tuple[float, float, float]:

@@ -1,79 +1,115 @@
 """
 The instants of the exposure that each block of sixteen pixels has, and where it reads at each.
 
-Notation as in sweep.py: nearness (H, N, W') inverse depth seen [1/m], flow (H, 4, W') a_x, a_y
-[px], b_x, b_y [px m] of the flow a + w b. A block with n of the N instants has them evenly over
-the exposure, and the first n of its places in all arrays.
+Notation as in sweep.py; flow (W' + 8 H,) as `seen.flow_rows` gives it. A block with n of the N
+instants has them evenly over the exposure, and the first n of its places in all arrays. What it
+sees lies side by side, in sixteen bits: the kernels wait for memory more than they calculate.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
 
 from depth_deblur_ros.core.data import FloatImage
-from depth_deblur_ros.core.lanes import greatest, larger, least, load, smaller, splat, store, WIDTH
+from depth_deblur_ros.core.lanes import (
+    greatest,
+    larger,
+    least,
+    load,
+    load_whole,
+    smaller,
+    splat,
+    store,
+    store_whole,
+    whole,
+    WIDTH,
+)
+from depth_deblur_ros.core.seen import ROW
 from depth_deblur_ros.core.threads import on_threads, SHARED
 from numba import njit
 import numpy as np
 import numpy.typing as npt
 
 FEWEST = 3  # instants of a block
+MANY = 20  # offsets of one block; with more, each pixel reads by itself
+APART = 1000  # offsets that a block is said to need where some pixel reads too far
+MOST = 65535  # the nearest that a block sees
+OF_NEARNESS = 5  # of a row's numbers of the flow: the first that stands for px m
 
 
-def thinned(
-    nearness: FloatImage, flow: FloatImage, spacing: float
-) -> tuple[FloatImage, FloatImage]:
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What blocks see at their own instants, and where they read."""
+
+    nearness: npt.NDArray[np.uint16]  # (H, W' / 16, N, 16) inverse depth seen, in parts of `flow`
+    flow: FloatImage  # (W' + 8 H,) as `seen.flow_rows` gives it, for inverse depth as above
+    shares: FloatImage  # (H, W' / 16) 1 / how many instants a block has: its first ones above
+    cells: npt.NDArray[np.int16]  # (H, W' / 16, N, 4) least offset x, y; how many x, y
+
+
+def laid_out(seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32) -> Layout:
     """
-    Give what blocks see at their own instants, and 1 / n of each (H, W' / 16).
+    Lay out inverse depth seen (H, N, W') [1/m] for blocks, and flow (W' + 8 H,).
 
     spacing: px of its own longest blur for which a block has an instant, of at most N; 0: all N.
+    far: px, the longest displacement along an axis.
     """
-    height, samples, width = nearness.shape
-    shares = np.full((height, width // WIDTH), 1 / samples, np.float32)
-    if not spacing:
-        return nearness, shares
-    kept = np.empty_like(nearness)
-    on_threads(_thin, height, nearness, flow, np.float32(spacing), kept, shares)
-    return kept, shares
-
-
-def cells_of(
-    nearness: FloatImage, flow: FloatImage, shares: FloatImage, far: np.float32
-) -> npt.NDArray[np.int16]:
-    """Give the least offset x, y that a block reads, and how many x, y (H, W' / 16, N, 4)."""
-    height, samples, width = nearness.shape
-    cells = np.empty((height, width // WIDTH, samples, 4), np.int16)
-    on_threads(_find_cells, height, nearness, flow, shares, far, cells)
-    return cells
+    height, samples, width = seen.shape
+    # Sixteen bits for the nearest: the longest displacement is off by a hundred thousandth.
+    unit = max(float(seen.max()), 1e-30) / MOST
+    flow = flow.copy()
+    flow[width:].reshape(height, ROW)[:, OF_NEARNESS:] *= np.float32(unit)
+    blocks = height, width // WIDTH
+    nearness = np.empty((*blocks, samples, WIDTH), np.uint16)
+    shares, cells = np.empty(blocks, np.float32), np.empty((*blocks, samples, 4), np.int16)
+    told = np.float32(1 / unit), np.float32(spacing), far
+    on_threads(_lay_out, height, seen, flow, *told, nearness, shares, cells)
+    return Layout(nearness, flow, shares, cells)
 
 
 @njit(cache=True, nogil=True, inline='always')
 def flow_at(y, k, flow, width):  # type: ignore[no-untyped-def]
     """Give a_x, a_y, b_x, b_y of a block."""
-    at = 4 * y * width + k * WIDTH
-    x, y = load(flow, at), load(flow, at + width)
-    return x, y, load(flow, at + 2 * width), load(flow, at + 3 * width)
+    xn, at = load(flow, k * WIDTH), width + ROW * y
+    ax = splat(flow[at]) + xn * (splat(flow[at + 1]) + xn * splat(flow[at + 2]))
+    ay = splat(flow[at + 3]) + xn * splat(flow[at + 4])
+    return ax, ay, splat(flow[at + 5]) + xn * splat(flow[at + 6]), splat(flow[at + 7])
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _count(y, k, seen, flow, unit, spacing, samples, width):  # type: ignore[no-untyped-def]
+    """Give how many instants a block has."""
+    if spacing == 0:
+        return samples
+    ax, ay, bx, by = flow_at(y, k, flow, width)
+    at, square = y * samples * width + k * WIDTH, splat(np.float32(0))
+    for i in range(samples):
+        w = splat(unit) * load(seen, at + i * width)
+        dx, dy = ax + w * bx, ay + w * by
+        square = larger(square, dx * dx + dy * dy)
+    return min(max(math.ceil(math.sqrt(greatest(square)) / spacing), FEWEST), samples)
 
 
 @njit(**SHARED)
-def _thin(first, end, nearness, flow, spacing, kept, shares):  # type: ignore[no-untyped-def]
-    """Give each block as many instants as its blur is long; keep what it sees at those."""
-    _, samples, width = nearness.shape
-    seen, parts, out = nearness.reshape(-1), flow.reshape(-1), kept.reshape(-1)
+def _lay_out(first, end, seen, flow, unit, spacing, far, nearness, shares, cells):  # type: ignore[no-untyped-def]
+    """Keep what each block sees at its own instants, and where it begins to read, how far."""
+    _, samples, width = seen.shape
+    flat, kept, half = seen.reshape(-1), nearness.reshape(-1), splat(np.float32(0.5))
     for y in range(first, end):
         for k in range(width // WIDTH):
-            ax, ay, bx, by = flow_at(y, k, parts, width)
-            at, square = y * samples * width + k * WIDTH, splat(np.float32(0))
-            for i in range(samples):
-                w = load(seen, at + i * width)
-                dx, dy = ax + w * bx, ay + w * by
-                square = larger(square, dx * dx + dy * dy)
-            length = math.sqrt(greatest(square)) / spacing
-            count = min(max(math.ceil(length), FEWEST), samples)
+            count = _count(y, k, flat, flow, unit, spacing, samples, width)
             shares[y, k] = 1 / count
+            ax, ay, bx, by = flow_at(y, k, flow, width)
+            at = (y * (width // WIDTH) + k) * samples * WIDTH
             for i in range(count):
                 nearest = (2 * i + 1) * samples // (2 * count)
-                store(out, at + i * width, load(seen, at + nearest * width))
+                w = load(flat, (y * samples + nearest) * width + k * WIDTH)
+                w, back = whole(splat(unit) * w + half), splat(back_at(i, shares[y, k]))
+                store_whole(kept, at + i * WIDTH, w)
+                dx, dy = _displacement(ax, bx, w, back), _displacement(ay, by, w, back)
+                cells[y, k, i, 0], cells[y, k, i, 2] = _span(dx, far)
+                cells[y, k, i, 1], cells[y, k, i, 3] = _span(dy, far)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -83,32 +119,57 @@ def back_at(i, share):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def displacement(a, b, w, back, far):  # type: ignore[no-untyped-def]
-    """Give how far from its own place a pixel reads, along one axis [px]; at most far."""
-    return larger(smaller(back * (a + w * b), splat(far)), splat(-far))
+def _displacement(a, b, w, back):  # type: ignore[no-untyped-def]
+    """Give how far from its own place a pixel reads, along one axis [px]."""
+    return back * (a + w * b)
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _span(lanes):  # type: ignore[no-untyped-def]
+def _within(lanes, least, most):  # type: ignore[no-untyped-def]
+    """Give what lies beyond two bounds as the bound."""
+    return larger(smaller(lanes, splat(most)), splat(least))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _span(lanes, far):  # type: ignore[no-untyped-def]
     """Give the first offset that a block's displacements need, and how many."""
-    first = np.intp(np.floor(least(lanes)))
-    return first, np.intp(np.floor(greatest(lanes))) - first + 2
+    low, high = least(lanes), greatest(lanes)
+    first = np.intp(np.floor(min(max(low, -far), far)))
+    if low < -far or high > far:
+        return first, APART
+    return first, np.intp(np.floor(high)) - first + 2
 
 
-@njit(**SHARED)
-def _find_cells(first, end, nearness, flow, shares, far, cells):  # type: ignore[no-untyped-def]
-    """Write where each block begins to read at each instant, and how many columns and rows."""
-    _, samples, width = nearness.shape
-    near, parts = nearness.reshape(-1), flow.reshape(-1)
-    for y in range(first, end):
-        for k in range(width // WIDTH):
-            ax, ay, bx, by = flow_at(y, k, parts, width)
-            for i in range(samples):
-                back = back_at(i, shares[y, k])
-                if back < np.float32(-0.5):
-                    break
-                w = load(near, (y * samples + i) * width + k * WIDTH)
-                dx = displacement(ax, bx, w, splat(back), far)
-                dy = displacement(ay, by, w, splat(back), far)
-                cells[y, k, i, 0], cells[y, k, i, 2] = _span(dx)
-                cells[y, k, i, 1], cells[y, k, i, 3] = _span(dy)
+@njit(cache=True, nogil=True, inline='always')
+def aim(place, i, share, parts, data):  # type: ignore[no-untyped-def]
+    """
+    Say where a block reads at instant i; place: y, k, N, W'.
+
+    Displacements u, v from the first offset; the offset's columns and rows from the block's own
+    place; how many columns and rows of offsets there are.
+    """
+    y, k, samples, width = place
+    ax, ay, bx, by = parts
+    near, _, _, cells = data
+    at = (y * (width // WIDTH) + k) * samples + i
+    w, back, c = load_whole(near, at * WIDTH), splat(back_at(i, share)), 4 * at
+    left, top = np.intp(cells[c]), np.intp(cells[c + 1])
+    u = _displacement(ax, bx, w, back) - splat(np.float32(left))
+    v = _displacement(ay, by, w, back) - splat(np.float32(top))
+    return u, v, left, top, np.intp(cells[c + 2]), np.intp(cells[c + 3])
+
+
+@njit(cache=True, nogil=True, inline='always')
+def bilinear(u, v):  # type: ignore[no-untyped-def]
+    """Give the weights of a cell's corners: above, above right, below, below right."""
+    w11 = u * v
+    w10, w01 = v - w11, u - w11
+    return splat(np.float32(1)) - u - w10, w01, w10, w11
+
+
+@njit(cache=True, nogil=True, inline='always')
+def apart(places, u, v, left, top, far):  # type: ignore[no-untyped-def]
+    """Note where each pixel of a block reads: at most `far` away."""
+    x, y = np.float32(left), np.float32(top)
+    store(places, 0, _within(u, -far - x, far - x))
+    store(places, WIDTH, _within(v, -far - y, far - y))

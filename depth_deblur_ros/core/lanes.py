@@ -2,9 +2,9 @@
 Sixteen float32 side by side, for compiled kernels.
 
 A loop that reads an image at places known only when it runs is not turned into vector code by
-the compiler. With these a kernel says so itself: load and store sixteen neighbours, and + - * on
-all of them at once. Where registers are narrower, the compiler takes several. Indices count from
-the start of a contiguous array and are not checked.
+the compiler. With these a kernel says so itself: load and store sixteen neighbours, and + - * /
+on all of them at once. Where registers are narrower, the compiler takes several. Indices count
+from the start of a contiguous array and are not checked.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, _VECTOR)  # type: ignore[no-untyped-call]
 
 
-def _fits(array: Any) -> bool:
-    return bool(array.dtype == types.float32 and array.layout == 'C' and array.ndim == 1)
+def _fits(array: Any, kind: Any = types.float32) -> bool:
+    return bool(array.dtype == kind and array.layout == 'C' and array.ndim == 1)
 
 
-def _address(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+def _address(context: Any, builder: Any, kinds: Any, values: Any, kind: Any = _VECTOR) -> Any:
     array = context.make_array(kinds[0])(context, builder, value=values[0])
-    return builder.bitcast(builder.gep(array.data, [values[1]]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(array.data, [values[1]]), kind.as_pointer())
 
 
 @_instruction  # type: ignore[untyped-decorator]
@@ -79,6 +79,35 @@ def store(typing: Any, array: Any, index: Any, lanes: Any) -> Any:
     return (types.void(array, types.intp, LANES), build) if _fits(array) else None
 
 
+_SHORTS = ir.VectorType(ir.IntType(16), WIDTH)
+
+
+@_instruction  # type: ignore[untyped-decorator]
+def load_whole(typing: Any, array: Any, index: Any) -> Any:
+    """Read the elements index to index + 15 of a contiguous uint16 array as float32."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        place = _address(context, builder, signature.args, values, _SHORTS)
+        found = builder.zext(builder.load(place, align=2), ir.VectorType(_INDEX, WIDTH))
+        return builder.sitofp(found, _VECTOR)
+
+    return (LANES(array, types.intp), build) if _fits(array, types.uint16) else None
+
+
+@_instruction  # type: ignore[untyped-decorator]
+def store_whole(typing: Any, array: Any, index: Any, lanes: Any) -> Any:
+    """Write values of 0 to 65535, less what follows the point, to a contiguous uint16 array."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        place = _address(context, builder, signature.args, values, _SHORTS)
+        found = builder.fptosi(values[2], ir.VectorType(_INDEX, WIDTH))
+        builder.store(builder.trunc(found, _SHORTS), place, align=2)
+        return context.get_dummy_value()
+
+    fits = _fits(array, types.uint16)
+    return (types.void(array, types.intp, LANES), build) if fits else None
+
+
 @_instruction  # type: ignore[untyped-decorator]
 def splat(typing: Any, value: Any) -> Any:
     """Give sixteen times one float32."""
@@ -91,14 +120,14 @@ def splat(typing: Any, value: Any) -> Any:
 
 
 @_instruction  # type: ignore[untyped-decorator]
-def next_lane(typing: Any, lanes: Any) -> Any:
-    """Move each value to the next lane; the first gets 0, the last one's is lost."""
+def next_lane(typing: Any, lanes: Any, before: Any) -> Any:
+    """Move each value to the next lane; the first gets the last one of those before."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        zeros = ir.Constant(_VECTOR, [0.0] * WIDTH)
-        return builder.shuffle_vector(values[0], zeros, _order([WIDTH, *range(WIDTH - 1)]))
+        order = _order(list(range(WIDTH - 1, 2 * WIDTH - 1)))
+        return builder.shuffle_vector(values[1], values[0], order)
 
-    return LANES(LANES), build
+    return LANES(LANES, LANES), build
 
 
 @_instruction  # type: ignore[untyped-decorator]
@@ -252,6 +281,7 @@ _stands_for(operator.add, 'fadd')
 _stands_for(operator.iadd, 'fadd')
 _stands_for(operator.sub, 'fsub')
 _stands_for(operator.mul, 'fmul')
+_stands_for(operator.truediv, 'fdiv')
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -14,6 +14,7 @@ from numba import njit
 import numpy as np
 
 MIN_INVERSE_DEPTH = 1e-4  # 1/m; beyond 10 km nothing moves
+ROW = 8  # numbers that `flow_rows` gives of each row
 LEAST_GROWTH = 0.1  # a surface that comes closer than this share of its depth counts as there
 
 
@@ -22,7 +23,7 @@ def seen_inverse_depth(
 ) -> FloatImage:
     """Give w_i (H, W, samples) [1/m]: what each pixel sees at each instant, (4)."""
     ray, packed = pack(motion, camera)
-    flow = flow_parts(ray, packed, depth.shape)
+    flow = flow_rows(ray, packed, depth.shape)
     planes = seen_planes(nearness_of(depth), ray, packed, flow, samples)
     return seen_by_pixel(planes, depth.shape[1])
 
@@ -36,7 +37,8 @@ def seen_planes(
     nearness: FloatImage, ray: FloatImage, packed: FloatImage, flow: FloatImage, samples: int
 ) -> FloatImage:
     """Give w_i (H, samples, W'), beyond W as at its rim; ray, packed and flow as below."""
-    seen = np.empty((len(nearness), samples, flow.shape[2]), np.float32)
+    width = len(flow) - ROW * len(nearness)
+    seen = np.empty((len(nearness), samples, width), np.float32)
     on_threads(_see, samples, nearness, ray, packed, flow, seen)
     return seen
 
@@ -55,23 +57,23 @@ def pack(motion: Motion, camera: CameraIntrinsics) -> tuple[FloatImage, FloatIma
     return ray, np.concatenate([motion.vector, focal, motion.rolling]).astype(np.float32)
 
 
-def flow_parts(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> FloatImage:
-    """Give a_x, a_y [px], b_x, b_y [px m] of the flow a + w b, (3): (H, 4, W'), its rim beyond."""
+def flow_rows(ray: FloatImage, motion: FloatImage, shape: tuple[int, int]) -> FloatImage:
+    """
+    Give the flow a + w b, (3), by what it takes to calculate it: (W' + 8 H,).
+
+    xn of the columns, its rim beyond; then of each row what makes, with xn^0, xn^1, ...: a_x
+    (three), a_y (two) [px], b_x (two), b_y (one) [px m].
+    """
     height, width = shape
-    xn = np.pad(ray[:width], (0, whole_blocks(width) - width), 'edge')[None]
-    yn = ray[width:, None]
-    tx, ty, tz = motion[:3, None, None] + motion[8:, None, None] * yn
+    xn = np.pad(ray[:width], (0, whole_blocks(width) - width), 'edge')
+    yn = ray[width:]
+    tx, ty, tz = motion[:3, None] + motion[8:, None] * yn
     vx, vy, vz, fx, fy = motion[3:8]
-    parts = np.empty((height, 4, xn.size), np.float32)
-    # In place: whole arrays of their own for each term would take twice the time.
-    np.multiply(fx * ty, 1 + xn * xn, out=parts[:, 0])
-    parts[:, 0] -= (fx * tx * yn) * xn
-    parts[:, 0] -= fx * tz * yn
-    np.multiply(fy * (ty * yn + tz), xn, out=parts[:, 1])
-    parts[:, 1] -= fy * (1 + yn * yn) * tx
-    parts[:, 2] = fx * (vx - xn * vz)
-    parts[:, 3] = fy * (vy - yn * vz)
-    return parts
+    rows = np.empty((height, ROW), np.float32)
+    rows[:, 0], rows[:, 1], rows[:, 2] = fx * (ty - tz * yn), -fx * tx * yn, fx * ty
+    rows[:, 3], rows[:, 4] = -fy * (1 + yn * yn) * tx, fy * (ty * yn + tz)
+    rows[:, 5], rows[:, 6], rows[:, 7] = fx * vx, -fx * vz, fy * (vy - yn * vz)
+    return np.concatenate([xn, rows.ravel()])
 
 
 @njit(**SHARED)
@@ -107,12 +109,13 @@ def _place_row(y, t, nearness, ray, motion, flow, across, places, values):  # ty
     high, wide = np.float32(height + 1), np.float32(width + 1)
     one, least, zero = np.float32(1), np.float32(LEAST_GROWTH), np.float32(0)
     roll, row = one + t * motion[0] * ray[width + y], np.float32(y + 1)
-    near, ax, ay, bx, by = nearness[y], flow[y, 0], flow[y, 1], flow[y, 2], flow[y, 3]
+    near, m = nearness[y], flow[len(flow) - ROW * (height - y) :]
+    ax, ax1, ax2, ay, ay1, bx, bx1, by = m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7]
     for x in range(np.uintp(0), np.uintp(width)):
-        w = near[x]
-        growth = roll + t * (motion[5] * w - motion[1] * ray[x])
-        px = across[x] + t * (ax[x] + w * bx[x])
-        py = row + t * (ay[x] + w * by[x])
+        w, xn = near[x], ray[x]
+        growth = roll + t * (motion[5] * w - motion[1] * xn)
+        px = across[x] + t * (ax + xn * (ax1 + xn * ax2) + w * (bx + xn * bx1))
+        py = row + t * (ay + xn * ay1 + w * by)
         inside = (px >= zero) & (px < wide) & (py >= zero) & (py < high)
         place = np.int32(py) * np.int32(width + 1) + np.int32(px)
         places[x] = place if inside else np.int32(0)

@@ -9,7 +9,8 @@ At one instant the pixels of a block read places that lie side by side, too, but
 and for edges in depth. So a block reads the same few offsets for all its pixels: 2 x 2 of them
 where all displacements fall into one cell, with bilinear weights; some more where they straddle a
 cell's border, weighted by tents, which comes to the same; pixel by pixel beyond MANY. In
-a thinned sweep blocks with a shorter blur have fewer instants (instants.py).
+a thinned sweep blocks with a shorter blur have fewer instants (instants.py). What is gathered here
+is spread again in scatter.py.
 """
 
 from __future__ import annotations
@@ -20,23 +21,22 @@ import math
 from typing import Any
 
 from depth_deblur_ros.core.data import FloatImage
-from depth_deblur_ros.core.instants import back_at, cells_of, displacement, flow_at, thinned
-from depth_deblur_ros.core.lanes import (
-    last_lane,
-    load,
-    next_lane,
-    splat,
-    store,
-    tent,
-    whole_blocks,
-    WIDTH,
+from depth_deblur_ros.core.instants import (
+    aim,
+    apart,
+    back_at,
+    bilinear,
+    flow_at,
+    laid_out,
+    Layout,
+    MANY,
 )
+from depth_deblur_ros.core.lanes import load, splat, store, tent, whole_blocks, WIDTH
+from depth_deblur_ros.core.scatter import scatter_rows
 from depth_deblur_ros.core.threads import on_threads, SHARED, threads_here
 from numba import njit
 import numpy as np
-import numpy.typing as npt
 
-MANY = 20  # offsets of one block
 GUARD = 2  # px beyond the margin, so that neighbours of what is read exist in every plane
 
 
@@ -44,23 +44,25 @@ GUARD = 2  # px beyond the margin, so that neighbours of what is read exist in e
 class Sweep:
     """A of one motion, laid out for blocks; its room is for one thread's work at a time."""
 
-    nearness: FloatImage  # (H, N, W') inverse depth seen [1/m]
-    flow: FloatImage  # (H, 4, W') a_x, a_y [px], b_x, b_y [px m] of the flow a + w b
-    shares: FloatImage  # (H, W' / 16) 1 / how many instants a block has: its first ones above
-    cells: npt.NDArray[np.int16]  # (H, W' / 16, N, 4) least offset x, y; how many x, y
+    layout: Layout
     far: np.float32  # px, the longest displacement along an axis
     room: int  # r
 
     @property
+    def blurred_shape(self) -> tuple[int, int, int]:
+        """Shape of blurred planes."""
+        height, blocks = self.layout.shares.shape
+        return 3, height, blocks * WIDTH
+
+    @property
     def latent_shape(self) -> tuple[int, int, int]:
         """Shape of latent planes."""
-        height, _, width = self.nearness.shape
+        _, height, width = self.blurred_shape
         return 3, height + 2 * self.room, whole_blocks(width + 2 * self.room)
 
     def blurred_planes(self, image: FloatImage) -> FloatImage:
         """Lay out a blurred image (H, W, 3) as planes, zero beyond it."""
-        height, _, width = self.nearness.shape
-        planes = np.zeros((3, height, width), np.float32)
+        planes = np.zeros(self.blurred_shape, np.float32)
         planes[:, :, : image.shape[1]] = np.moveaxis(image, 2, 0)
         return planes
 
@@ -74,15 +76,26 @@ class Sweep:
         self, latent: FloatImage, weight: FloatImage, out: FloatImage | None = None
     ) -> FloatImage:
         """Give weight (3, H, W') times A L of latent planes, in `out` if given."""
-        blurred = np.empty_like(weight) if out is None else out
-        on_threads(_gather, len(self.nearness), latent, weight, blurred, *self._parts())
+        return self._gathered(latent, weight, out, less=False)
+
+    def missing(
+        self, data: FloatImage, latent: FloatImage, out: FloatImage | None = None
+    ) -> FloatImage:
+        """Give blurred planes (3, H, W') less A L of latent planes, in `out` if given."""
+        return self._gathered(latent, data, out, less=True)
+
+    def _gathered(
+        self, latent: FloatImage, own: FloatImage, out: FloatImage | None, *, less: bool
+    ) -> FloatImage:
+        blurred = np.empty_like(own) if out is None else out
+        rows = self.blurred_shape[1]
+        on_threads(_gather, rows, latent, own, less, blurred, *self._parts())
         return blurred
 
     @cached_property
     def taken(self) -> FloatImage:
         """Room for blurred planes."""
-        height, _, width = self.nearness.shape
-        return np.empty((3, height, width), np.float32)
+        return np.empty(self.blurred_shape, np.float32)
 
     @cached_property
     def directions(self) -> FloatImage:
@@ -92,21 +105,21 @@ class Sweep:
     @cached_property
     def strips(self) -> FloatImage:
         """Room for what each thread of `scatter` writes: (n, 3, rows, w)."""
-        height = self.nearness.shape[0]
+        _, height, _ = self.blurred_shape
         count = min(threads_here(), height)
         _, _, wide = self.latent_shape
         return np.empty((count, 3, math.ceil(height / count) + 2 * self.room, wide), np.float32)
 
     def scatter(self, blurred: FloatImage) -> FloatImage:
         """Spread blurred planes over `strips`; row j of strip k of n: latent row k H // n + j."""
-        on_threads(_scatter, len(self.strips), blurred, self.strips, *self._parts())
+        on_threads(scatter_rows, len(self.strips), blurred, self.strips, *self._parts())
         return self.strips
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
         """Give A' B in latent planes."""
         strips = self.scatter(blurred)
         latent = np.zeros(self.latent_shape, np.float32)
-        height, count = self.nearness.shape[0], len(strips)
+        height, count = self.blurred_shape[1], len(strips)
         for k, strip in enumerate(strips):
             first = k * height // count
             rows = min(strip.shape[1], latent.shape[1] - first)
@@ -114,27 +127,18 @@ class Sweep:
         return latent
 
     def _parts(self) -> tuple[Any, ...]:
-        return self.nearness, self.flow, self.shares, self.cells, self.far, self.room
+        told = self.layout
+        return told.nearness, told.flow, told.shares, told.cells, self.far, self.room
 
 
-def sweep_of(nearness: FloatImage, flow: FloatImage, margin: int, spacing: float = 0.0) -> Sweep:
+def sweep_of(seen: FloatImage, flow: FloatImage, margin: int, spacing: float = 0.0) -> Sweep:
     """
-    Lay out A for nearness (H, N, W') and flow (H, 4, W'); no pixel reads beyond the margin.
+    Lay out A for inverse depth seen (H, N, W') and flow; no pixel reads beyond the margin.
 
     spacing: px of its own longest blur for which a block has an instant, of at most N; 0: all N.
     """
     far = np.float32(margin - 1)
-    nearness, shares = thinned(nearness, flow, spacing)
-    cells = cells_of(nearness, flow, shares, far)
-    return Sweep(nearness, flow, shares, cells, far, margin + GUARD)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _bilinear(u, v):  # type: ignore[no-untyped-def]
-    """Give the weights of a cell's corners: above, above right, below, below right."""
-    w11 = u * v
-    w10, w01 = v - w11, u - w11
-    return splat(np.float32(1)) - u - w10, w01, w10, w11
+    return Sweep(laid_out(seen, flow, spacing, far), far, margin + GUARD)
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -159,27 +163,13 @@ def _read_each(plane, p, wide, places):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _aim(place, i, share, parts, data, far):  # type: ignore[no-untyped-def]
-    """
-    Say where a block reads at instant i; place: y, k, N, W'.
-
-    Displacements u, v from the first offset; the offset's columns and rows from the block's own
-    place; how many columns and rows of offsets there are.
-    """
-    y, k, samples, width = place
-    ax, ay, bx, by = parts
-    near, _, _, cells = data
-    w, back = load(near, (y * samples + i) * width + k * WIDTH), splat(back_at(i, share))
-    c = 4 * ((y * (width // WIDTH) + k) * samples + i)
-    left, top = np.intp(cells[c]), np.intp(cells[c + 1])
-    u = displacement(ax, bx, w, back, far) - splat(np.float32(left))
-    v = displacement(ay, by, w, back, far) - splat(np.float32(top))
-    return u, v, left, top, np.intp(cells[c + 2]), np.intp(cells[c + 3])
+def _finish(own, less, blurred, at, found):  # type: ignore[no-untyped-def]
+    store(blurred, at, load(own, at) - found if less else load(own, at) * found)
 
 
 @njit(cache=True, nogil=True)
-def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ignore[no-untyped-def]
-    """Write one row of `gather`; planes are flat, data the flat arrays of a Sweep."""
+def _gather_row(y, latent, own, less, blurred, data, far, room, sizes):  # type: ignore[no-untyped-def]
+    """Write one row of own times A L, or less A L; all are flat, data the arrays of a Sweep."""
     height, samples, width, high, wide = sizes
     plane, colour = high * wide, height * width
     places = np.empty(3 * WIDTH, np.float32)
@@ -190,10 +180,10 @@ def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ig
             if back_at(i, one) < np.float32(-0.5):
                 break
             place = y, k, samples, width
-            u, v, left, top, columns, rows = _aim(place, i, one, parts, data, far)
+            u, v, left, top, columns, rows = aim(place, i, one, parts, data)
             p = (y + room + top) * wide + k * WIDTH + room + left
             if columns == 2 and rows == 2:
-                corners = _bilinear(u, v)
+                corners = bilinear(u, v)
                 r += _read(latent, p, wide, corners)
                 g += _read(latent, p + plane, wide, corners)
                 b += _read(latent, p + 2 * plane, wide, corners)
@@ -206,110 +196,22 @@ def _gather_row(y, latent, weight, blurred, data, far, room, sizes):  # type: ig
                         g += share_of * load(latent, q + plane)
                         b += share_of * load(latent, q + 2 * plane)
             else:
-                store(places, 0, u)
-                store(places, WIDTH, v)
+                apart(places, u, v, left, top, far)
                 r += _read_each(latent, p, wide, places)
                 g += _read_each(latent, p + plane, wide, places)
                 b += _read_each(latent, p + 2 * plane, wide, places)
         at, share = y * width + k * WIDTH, splat(one)
-        store(blurred, at, share * load(weight, at) * r)
-        store(blurred, at + colour, share * load(weight, at + colour) * g)
-        store(blurred, at + 2 * colour, share * load(weight, at + 2 * colour) * b)
+        _finish(own, less, blurred, at, share * r)
+        _finish(own, less, blurred, at + colour, share * g)
+        _finish(own, less, blurred, at + 2 * colour, share * b)
 
 
 @njit(**SHARED)
-def _gather(first, end, latent, weight, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
-    height, samples, width = nearness.shape
+def _gather(first, end, latent, own, less, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
+    height, blocks, samples, _ = nearness.shape
+    width = blocks * WIDTH
     sizes = (height, samples, width, latent.shape[1], latent.shape[2])
     data = (nearness.reshape(-1), flow.reshape(-1), shares.reshape(-1), cells.reshape(-1))
-    flat = (latent.reshape(-1), weight.reshape(-1), blurred.reshape(-1))
+    flat = (latent.reshape(-1), own.reshape(-1), less, blurred.reshape(-1))
     for y in range(first, end):
         _gather_row(y, *flat, data, far, room, sizes)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _add(plane, p, lanes):  # type: ignore[no-untyped-def]
-    store(plane, p, load(plane, p) + lanes)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _spread(plane, p, wide, w, value):  # type: ignore[no-untyped-def]
-    """Add to a row and the one below, each once: what overlaps has to wait for its turn."""
-    here, beside = w[0] * value, w[1] * value
-    _add(plane, p, here + next_lane(beside))
-    plane[p + WIDTH] += last_lane(beside)
-    here, beside = w[2] * value, w[3] * value
-    _add(plane, p + wide, here + next_lane(beside))
-    plane[p + wide + WIDTH] += last_lane(beside)
-
-
-@njit(cache=True, nogil=True)
-def _spread_each(plane, p, wide, places, value):  # type: ignore[no-untyped-def]
-    """Spread for each pixel of a block by itself; places (3, 16): u, v, scratch."""
-    store(places, 2 * WIDTH, value)
-    for k in range(WIDTH):
-        u, v, b = places[k], places[WIDTH + k], places[2 * WIDTH + k]
-        x0, y0 = math.floor(u), math.floor(v)
-        u, v = u - x0, v - y0
-        q = p + k + y0 * wide + x0
-        plane[q] += (1 - v) * (1 - u) * b
-        plane[q + 1] += (1 - v) * u * b
-        plane[q + wide] += v * (1 - u) * b
-        plane[q + wide + 1] += v * u * b
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _shared(blurred, at, colour, share):  # type: ignore[no-untyped-def]
-    """Give an instant's share of the three colours of a block."""
-    r, g, b = load(blurred, at), load(blurred, at + colour), load(blurred, at + 2 * colour)
-    return share * r, share * g, share * b
-
-
-@njit(cache=True, nogil=True)
-def _scatter_row(y, first, strip, blurred, data, far, room, sizes):  # type: ignore[no-untyped-def]
-    """Spread one row over a strip that begins at row `first`; planes and strip are flat."""
-    height, samples, width, high, wide = sizes
-    plane, colour = high * wide, height * width
-    places = np.empty(3 * WIDTH, np.float32)
-    for i in range(samples):
-        for k in range(width // WIDTH):
-            one = data[2][y * (width // WIDTH) + k]
-            if back_at(i, one) < np.float32(-0.5):
-                continue
-            r, g, b = _shared(blurred, y * width + k * WIDTH, colour, splat(one))
-            place, parts = (y, k, samples, width), flow_at(y, k, data[1], width)
-            u, v, left, top, columns, rows = _aim(place, i, one, parts, data, far)
-            p = (y - first + room + top) * wide + k * WIDTH + room + left
-            if columns == 2 and rows == 2:
-                corners = _bilinear(u, v)
-                _spread(strip, p, wide, corners, r)
-                _spread(strip, p + plane, wide, corners, g)
-                _spread(strip, p + 2 * plane, wide, corners, b)
-            elif columns * rows <= MANY:
-                for j in range(rows):
-                    down = tent(v - splat(np.float32(j)))
-                    for m in range(columns):
-                        share_of, q = down * tent(u - splat(np.float32(m))), p + j * wide + m
-                        _add(strip, q, share_of * r)
-                        _add(strip, q + plane, share_of * g)
-                        _add(strip, q + 2 * plane, share_of * b)
-            else:
-                store(places, 0, u)
-                store(places, WIDTH, v)
-                _spread_each(strip, p, wide, places, r)
-                _spread_each(strip, p + plane, wide, places, g)
-                _spread_each(strip, p + 2 * plane, wide, places, b)
-
-
-@njit(**SHARED)
-def _scatter(first, end, blurred, strips, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
-    height, samples, width = nearness.shape
-    sizes = (height, samples, width, strips.shape[2], strips.shape[3])
-    data = (nearness.reshape(-1), flow.reshape(-1), shares.reshape(-1), cells.reshape(-1))
-    flat, count = blurred.reshape(-1), strips.shape[0]
-    for k in range(first, end):
-        strip = strips[k].reshape(-1)
-        strip[:] = 0
-        top = k * height // count
-        for y in range(top, (k + 1) * height // count):
-            _scatter_row(y, top, strip, flat, data, far, room, sizes)
