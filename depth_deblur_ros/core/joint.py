@@ -18,6 +18,7 @@ from functools import partial
 import math
 from typing import TypeVar
 
+import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion, Vector
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import stored_from_light
@@ -188,8 +189,7 @@ def _parts(level: Level, length: float, effort: Effort) -> list[Part]:
 
 def _busiest(stored: FloatImage, rows: int, columns: int) -> tuple[int, int]:
     """Find the window of this size with the strongest gradients; its first row and column."""
-    down, aside = np.gradient(stored)
-    sums = np.pad(np.hypot(down, aside).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    sums = cv2.integral(np.hypot(*np.gradient(stored)))
     inside = sums[rows:, columns:] - sums[:-rows, columns:]
     inside = inside - sums[rows:, :-columns] + sums[:-rows, :-columns]
     y, x = np.unravel_index(int(np.argmax(inside)), inside.shape)

@@ -22,12 +22,14 @@ import cv2
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.compression import block_sigma
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, MIN_SIDE, Motion
+from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import light_ease, light_from_stored, stored_from_light
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.quadratic import conjugate_gradients, reweighted
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 
+SHOWN = 4.0  # px of mean blur for which half of a size is worth it; of the full one it always is
 SATURATED = 0.99  # stored values above may stand for any amount of light
 # px of the longest blur, and of a block's own, from one instant of the exposure to the next, and
 # what noise adds to them in brief
@@ -64,6 +66,7 @@ class Effort:
     steps: LatentSteps
     spacing: tuple[float, float]  # px of the longest blur and of a block's for an instant
     longer: float  # how much longer each reweighting is at half the size
+    sizes: int  # how many below this one
 
 
 def noise_sigma(stored: FloatImage) -> float:
@@ -99,14 +102,17 @@ def restore_coarse_to_fine(
     Give the sharp image (H, W, 3), stored values, under a known motion; depth (H, W) filled [m].
 
     At half the size an eighth of the work brings most of what is long and slow to converge, and
-    so on. Noise makes the prior weigh more, which takes fewer steps, and in brief fewer instants.
+    so on, as long as blur shows. Noise makes the prior weigh more, which takes fewer steps, and
+    in brief fewer instants.
     """
     sigma = picture_sigma(blurred)
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
     haste = 1 - worth if steps.brief else 0.0
     steps = replace(steps, inner=math.ceil(worth * steps.inner), early=1 - EARLIER * haste)
     spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
-    effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste)
+    length = blur_length(motion.by_rows, depth, camera)
+    sizes = 1 + max(0, math.floor(math.log2(max(length, SHOWN) / SHOWN)))
+    effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste, sizes)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
 
@@ -115,11 +121,11 @@ def _restored(level: Level, motion: Motion, effort: Effort) -> FloatImage:
     """Restore light from that of half the size, as long as there is one."""
     first, steps, camera = None, effort.steps, level.camera
     width, height = camera.width // 2, camera.height // 2
-    if min(width, height) >= MIN_SIDE:
+    if effort.sizes and min(width, height) >= MIN_SIDE:
         inner = round(effort.longer * steps.inner)
         coarse = replace(steps, outer=COARSE_OUTER, inner=inner)
         # Four pixels in one: half the noise.
-        less = replace(effort, sigma=effort.sigma / 2, steps=coarse)
+        less = replace(effort, sigma=effort.sigma / 2, steps=coarse, sizes=effort.sizes - 1)
         half = _restored(scaled_level(level, width, height), motion, less)
         first = _magnified(half, camera)
     longest, own = effort.spacing
@@ -159,17 +165,16 @@ def restored_light(
     light = light_from_stored(stored, transfer)
     full, noise = stored >= SATURATED, light_ease(stored, transfer)
     noise[:, :, width:] = 0
-    within, saturated = np.ones_like(light), bool(full.any())
+    saturated = bool(full.any())
     start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for k in range(steps.outer):
-        missing = sweep.gather(latent, within, sweep.taken)
-        np.subtract(light, missing, out=missing)
+        missing = sweep.missing(light, latent, sweep.taken)
         # What is saturated says only "at least this": drop it where the model gives more.
         trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
         problem = reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
         slope = problem.slope(missing, latent)
         latent = conjugate_gradients(problem, latent, slope, steps.within(k))
     r = sweep.room
-    return np.ascontiguousarray(np.moveaxis(latent[:, r : r + height, r : r + width], 0, 2))
+    return np.asarray(cv2.merge([*latent[:, r : r + height, r : r + width]]), np.float32)

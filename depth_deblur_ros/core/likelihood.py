@@ -115,7 +115,6 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
     pace = part.pace
     blur = blur_operator(Motion.from_vector(p), part.depth, part.camera, pace.spacing)
     sweep, transfer = blur.sweep, part.camera.transfer
-    within = sweep.blurred_planes(np.ones((*part.light.shape, 3), np.float32))
     latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
     data, trust = _observed(part, sweep)
     for k in reversed(range(REWEIGHTINGS)):
@@ -123,11 +122,11 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
         stored = np.repeat(stored_from_light(latent[:1], transfer), 3, 0)
         weight = np.float32(part.scales.prior * sigma**2)
         problem = reweighted(stored, sweep, transfer, trust, weight)
-        push = problem.slope(data - sweep.gather(latent, within), latent)
+        push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
         push[1:] += sigma * _prior_noise(problem, part.seed)
         latent = conjugate_gradients(problem, latent, push, pace.steps if k else LAST_STEPS)
         if follow and k:
-            missing = data - sweep.gather(latent, within)
+            missing = sweep.missing(data, latent)
             missing[1:] -= data[1:]
             part = _followed(part, problem, latent, missing)
             data, trust = _observed(part, sweep)
@@ -232,7 +231,7 @@ def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
         columns = sweep.blurred_planes(slope[..., some])
         push = sweep.adjoint(found.problem.trust * columns)
         z = conjugate_gradients(found.problem, np.zeros_like(push), push, steps)
-        answered = columns - sweep.gather(z, np.ones_like(columns))
+        answered = sweep.missing(columns, z)
         rest[..., some] = np.moveaxis(answered, 0, 2)[:, :width]
     # Over the length of a blur yn hardly changes: what it weighs is answered alike.
     yn = found.blur.ray[-len(rest) :, None, None]

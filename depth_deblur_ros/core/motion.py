@@ -193,7 +193,6 @@ def blur_and_slope(p: Vector, latent: Array, blur: BlurOperator) -> tuple[Array,
 def _blur_and_slope(first, end, latent, seen, ray, p, focal, margin, value, slope):  # type: ignore[no-untyped-def]
     width = seen.shape[1]
     for y in range(first, end):
-        lean = np.zeros((3, 5))  # of each channel: value, then dL times t and t w down each axis
         for x in range(width):
             xn, yn = np.float64(ray[x]), np.float64(ray[width + y])
             tx, ty, tz = p[0] + yn * p[6], p[1] + yn * p[7], p[2] + yn * p[8]
@@ -203,11 +202,12 @@ def _blur_and_slope(first, end, latent, seen, ray, p, focal, margin, value, slop
                 focal[0] * (p[3] - xn * p[5]),
                 focal[1] * (p[4] - yn * p[5]),
             )
-            _gather(latent, seen[y, x], x + margin, y + margin, flow, lean)
+            leans = _gather(latent, seen[y, x], x + margin, y + margin, flow)
             for c in range(3):
-                gx, hx = focal[0] * lean[c, 1], focal[0] * lean[c, 2]
-                gy, hy = focal[1] * lean[c, 3], focal[1] * lean[c, 4]
-                value[y, x, c] = lean[c, 0]
+                lean = leans[c]
+                gx, hx = focal[0] * lean[1], focal[0] * lean[2]
+                gy, hy = focal[1] * lean[3], focal[1] * lean[4]
+                value[y, x, c] = lean[0]
                 slope[y, x, c, 0] = -xn * yn * gx - (1 + yn * yn) * gy
                 slope[y, x, c, 1] = (1 + xn * xn) * gx + xn * yn * gy
                 slope[y, x, c, 2] = -yn * gx + xn * gy
@@ -217,26 +217,39 @@ def _blur_and_slope(first, end, latent, seen, ray, p, focal, margin, value, slop
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _gather(latent, near, x, y, flow, lean):  # type: ignore[no-untyped-def]
-    """Average L and its slope over the instants, along the flow (a, then b) of one pixel."""
+def _gather(latent, near, x, y, flow):  # type: ignore[no-untyped-def]
+    """
+    Average L and its slope over the instants, along the flow (a, then b) of one pixel.
+
+    Of each channel: value, then minus dL times t and t w down each axis.
+    """
     high, wide = latent.shape[0] - 1.001, latent.shape[1] - 1.001
     samples = near.shape[0]
-    lean[:] = 0
+    r = g = b = (0.0, 0.0, 0.0, 0.0, 0.0)
+    share = 1.0 / samples
     for i in range(samples):
-        t, w = (i + 0.5) / samples - 0.5, np.float64(near[i])
+        t, w = (i + 0.5) * share - 0.5, np.float64(near[i])
         px, py = x - t * (flow[0] + w * flow[2]), y - t * (flow[1] + w * flow[3])
         # Beyond the rim L goes on evenly: no slope.
-        tx = t / samples if 0 < px < wide else 0.0
-        ty = t / samples if 0 < py < high else 0.0
+        tx = t * share if 0 < px < wide else 0.0
+        ty = t * share if 0 < py < high else 0.0
         px, py = min(max(px, 0.0), wide), min(max(py, 0.0), high)
-        x0, y0 = int(px), int(py)
-        u, v = px - x0, py - y0
-        for c in range(3):
-            top, below = latent[y0, x0, c], latent[y0 + 1, x0, c]
-            dt, db = latent[y0, x0 + 1, c] - top, latent[y0 + 1, x0 + 1, c] - below
-            dx, dy = (1 - v) * dt + v * db, below + u * db - top - u * dt
-            lean[c, 0] += (top + u * dt + v * dy) / samples
-            lean[c, 1] -= tx * dx
-            lean[c, 2] -= tx * w * dx
-            lean[c, 3] -= ty * dy
-            lean[c, 4] -= ty * w * dy
+        x0, y0 = np.uintp(px), np.uintp(py)
+        place, weights = (y0, x0, px - x0, py - y0), (share, tx, ty, w)
+        r = _leant(r, latent, place, 0, weights)
+        g = _leant(g, latent, place, 1, weights)
+        b = _leant(b, latent, place, 2, weights)
+    return r, g, b
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _leant(lean, latent, place, c, weights):  # type: ignore[no-untyped-def]
+    """Add what one instant shows of a channel."""
+    y, x, u, v = place
+    share, tx, ty, w = weights
+    one = np.uintp(1)
+    top, below = latent[y, x, c], latent[y + one, x, c]
+    dt, db = latent[y, x + one, c] - top, latent[y + one, x + one, c] - below
+    dx, dy = tx * ((1 - v) * dt + v * db), ty * (below + u * db - top - u * dt)
+    value = share * (top + u * dt + v * (below + u * db - top - u * dt))
+    return lean[0] + value, lean[1] - dx, lean[2] - w * dx, lean[3] - dy, lean[4] - w * dy

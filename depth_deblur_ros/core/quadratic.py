@@ -9,9 +9,8 @@ weight that the present image gives it, the steps are preconditioned with l'^2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
-from depth_deblur_ros.core.data import FloatImage
+from depth_deblur_ros.core.data import FloatImage, Vector
 from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_ease
 from depth_deblur_ros.core.powers import over_three_fifths
@@ -40,21 +39,39 @@ class Quadratic:
     def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
         """Give minus the gradient at a latent image; missing = B - A latent."""
         strips = self.sweep.scatter(np.multiply(self.trust, missing, out=self.sweep.taken))
-        x, r = np.negative(latent, out=self.sweep.directions[0]), np.zeros_like(latent)
-        self._sum(strips, x, r)
+        r = np.zeros_like(latent)
+        self._sum(strips, latent, latent, r, -1)
         return r
 
-    def normal(self, d: FloatImage, q: FloatImage) -> float:
-        """Write the normal equations' matrix times d into q; give <d, q>."""
-        blurred = self.sweep.gather(d, self.trust, self.sweep.taken)
-        return self._sum(self.sweep.scatter(blurred), d, q)
+    def normal(self, d: FloatImage, r: FloatImage, q: FloatImage) -> Vector:
+        """
+        Write the normal equations' matrix times d into q.
 
-    def _sum(self, strips: FloatImage, x: FloatImage, out: FloatImage) -> float:
-        """Add strips of A' and the prior's part of x; give <x, out>."""
-        products = np.zeros(x.shape[1:2], np.float32)
-        rows = self.trust.shape[1]
-        on_threads(_sum_rows, len(products), strips, rows, x, self.links, self.ease, out, products)
+        Give <d, q>, and <r, q> and <q, q> preconditioned.
+        """
+        blurred = self.sweep.gather(d, self.trust, self.sweep.taken)
+        return self._sum(self.sweep.scatter(blurred), d, r, q, 1)
+
+    def advance(self, latent: FloatImage, r: FloatImage, step: float, turn: float) -> float:
+        """
+        Go along d = directions[0]: latent + step d, r - step q, then d = r / ease + turn d.
+
+        Gives <r, r> preconditioned.
+        """
+        products = np.zeros(r.shape[1], np.float32)
+        told = *self.sweep.directions, self.ease, np.float32(step), np.float32(turn), products
+        on_threads(_advance, len(products), latent, r, *told)
         return float(products.sum(dtype=np.float64))
+
+    def _sum(
+        self, strips: FloatImage, x: FloatImage, r: FloatImage, out: FloatImage, sign: float
+    ) -> Vector:
+        """Write strips of A' and sign times the prior's part of x; give products as `normal`."""
+        products = np.zeros((x.shape[1], 3), np.float32)
+        rows = self.trust.shape[1]
+        told = strips, rows, x, r, self.links, self.ease, np.float32(sign)
+        on_threads(_sum_rows, len(products), *told, out, products)
+        return np.asarray(products.sum(0, dtype=np.float64))
 
 
 def reweighted(
@@ -72,22 +89,20 @@ def conjugate_gradients(
     """
     Solve from latent by `limit` steps, preconditioned with l'^2.
 
-    slope: minus the gradient; written over.
+    slope: minus the gradient. Both are written over, and latent is given back.
     """
-    latent, r = latent.copy(), slope
+    r = slope
     d, q = problem.sweep.directions
     d[:] = 0
-    products = np.zeros(r.shape[1], np.float32)
-    rows = r.shape[1]
-    on_threads(_advance, rows, latent, r, d, q, problem.ease, np.float32(0), products)
-    rz, last = float(products.sum(dtype=np.float64)), math.inf
+    rz = problem.advance(latent, r, 0, 0)
     for _ in range(limit):
         if rz <= 0:
             break
-        on_threads(_turn, rows, d, r, problem.ease, np.float32(rz / last))
-        step = np.float32(rz / problem.normal(d, q))
-        on_threads(_advance, rows, latent, r, d, q, problem.ease, step, products)
-        rz, last = float(products.sum(dtype=np.float64)), rz
+        dq, rq, qq = problem.normal(d, r, q)
+        step = rz / dq
+        # What will be left is known before the step, which can turn d on its way.
+        left = max(0.0, rz - step * (2 * rq - step * qq))
+        rz = problem.advance(latent, r, step, left / rz)
     return latent
 
 
@@ -131,32 +146,35 @@ def _pull(u, links, ease, p, n, link):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _add_prior(y, x, links, ease, out, products, room):  # type: ignore[no-untyped-def]
-    """Add the prior's quadratic form of x to one row of out; all flat but out (3, h, w)."""
+def _add_prior(y, x, r, links, ease, sign, out, products, room):  # type: ignore[no-untyped-def]
+    """Add sign times the prior's part of x to one row of out; all flat but out (3, h, w)."""
     _, high, wide = out.shape
     flat, plane = out.reshape(-1), high * wide
-    product = splat(np.float32(0))
+    xq = rq = qq = splat(np.float32(0))
     for k in range(wide // WIDTH):
         here = y * wide + k * WIDTH
         for c in range(3):
             p = c * plane + here
-            s = load(flat, p)
+            pulls = splat(np.float32(0))
             for m in range(4):
                 ahead = (1, wide, wide + 1, wide - 1)[m]
-                s += _pull(x, links, ease, p, p + ahead, m * plane + here)
-                s += _pull(x, links, ease, p, p - ahead, m * plane + here - ahead)
-            store(flat, p, s)
-            product += load(x, p) * s
-    products[y] = total(product, room)
+                pulls += _pull(x, links, ease, p, p + ahead, m * plane + here)
+                pulls += _pull(x, links, ease, p, p - ahead, m * plane + here - ahead)
+            q = load(flat, p) + splat(sign) * pulls
+            store(flat, p, q)
+            z = q / load(ease, p)
+            xq, rq, qq = xq + load(x, p) * q, rq + load(r, p) * z, qq + q * z
+    products[y, 0], products[y, 1] = total(xq, room), total(rq, room)
+    products[y, 2] = total(qq, room)
 
 
 @njit(**SHARED)
-def _sum_rows(first, end, strips, rows, x, links, ease, out, products):  # type: ignore[no-untyped-def]
-    """Write the sum of strips of A' (of `rows` rows of B) and the prior's part of x into out."""
+def _sum_rows(first, end, strips, rows, x, r, links, ease, sign, out, products):  # type: ignore[no-untyped-def]
+    """Write strips of A' (of `rows` rows of B) and sign times the prior's part of x into out."""
     high = out.shape[1]
     count, _, depth, _ = strips.shape
     wide = out.shape[2]
-    x_flat, links_flat, ease_flat = x.reshape(-1), links.reshape(-1), ease.reshape(-1)
+    x, r, links, ease = x.reshape(-1), r.reshape(-1), links.reshape(-1), ease.reshape(-1)
     for y in range(max(first, GUARD), min(end, high - GUARD)):
         for c in range(3):
             for i in range(wide):
@@ -167,28 +185,19 @@ def _sum_rows(first, end, strips, rows, x, links, ease, out, products):  # type:
                     for i in range(wide):
                         out[c, y, i] += strips[k, c, j, i]
         room = np.empty(WIDTH, np.float32)
-        _add_prior(y, x_flat, links_flat, ease_flat, out, products, room)
+        _add_prior(y, x, r, links, ease, sign, out, products, room)
 
 
 @njit(fastmath=True, **SHARED)
-def _advance(first, end, latent, r, d, q, ease, step, products):  # type: ignore[no-untyped-def]
-    """Go along d: latent + step d, r - step q; give <r, r / ease> of each row."""
+def _advance(first, end, latent, r, d, q, ease, step, turn, products):  # type: ignore[no-untyped-def]
     width = r.shape[2]
     for y in range(first, end):
         s = np.float32(0)
         for c in range(3):
             for x in range(width):
                 latent[c, y, x] += step * d[c, y, x]
-                r[c, y, x] -= step * q[c, y, x]
-                s += r[c, y, x] * r[c, y, x] / ease[c, y, x]
+                left = r[c, y, x] - step * q[c, y, x]
+                z = left / ease[c, y, x]
+                r[c, y, x], d[c, y, x] = left, z + turn * d[c, y, x]
+                s += left * z
         products[y] = s
-
-
-@njit(fastmath=True, **SHARED)
-def _turn(first, end, d, r, ease, share):  # type: ignore[no-untyped-def]
-    """Turn d to r / ease + share d."""
-    width = r.shape[2]
-    for y in range(first, end):
-        for c in range(3):
-            for x in range(width):
-                d[c, y, x] = r[c, y, x] / ease[c, y, x] + share * d[c, y, x]
