@@ -10,6 +10,7 @@ from depth_deblur_ros.core.evidence import (
     gather_spectra,
     MAX_PATCHES,
     motion_axes,
+    rough_scores,
     scores,
     thinned,
 )
@@ -110,6 +111,26 @@ def test_the_score_is_its_slow_twin(seed):
     qs = rng.normal(0, 1, (20, 9)) * rng.uniform(0, 40, (20, 1))
     slow = [oracle.score(q, evidence, EVEN) for q in qs]
     np.testing.assert_allclose(scores(qs, evidence), slow, rtol=2e-4, atol=2e-4)
+
+
+@given(seed=seeds)
+@settings(max_examples=25)
+def test_the_rough_score_is_its_slow_twin(seed):
+    """That of the nearest templates: (11) without what lies between them."""
+    rng = np.random.default_rng(seed)
+    evidence = made_up_evidence(rng)
+    qs = rng.normal(0, 1, (20, 6)) * rng.uniform(0, 40, (20, 1))
+    flows = np.einsum('bij,mj->mbi', np.float64(evidence.flow_of_q[..., :6]), qs)
+    u, v = np.moveaxis(np.where(flows[..., 1:] < 0, -flows, flows), 2, 0)
+    inside = np.maximum(abs(u), v) < REACH
+    # A flow half-way between two templates may go to either.
+    sure = (np.abs((np.stack([u, v]) % 1) - 0.5).min((0, 2)) > 1e-4).nonzero()[0]
+    column, row = (np.floor(np.where(inside, a, 0) + 0.5).astype(int) for a in (u, v))
+    patch = np.arange(len(evidence.weight))
+    c = np.where(inside, evidence.match[patch, row, column + REACH], 0) @ evidence.weight
+    d = np.where(inside, evidence.energy[row, column + REACH], 1) @ evidence.weight
+    slow = -c / np.sqrt(d + EVEN)
+    np.testing.assert_allclose(rough_scores(qs, evidence)[sure], slow[sure], rtol=1e-4, atol=1e-5)
 
 
 @given(seed=seeds)

@@ -27,6 +27,7 @@ from depth_deblur_ros.core.lanes import (
     store,
     where_positive,
     whole,
+    whole_blocks,
     WIDTH,
 )
 from depth_deblur_ros.core.spectra import patch_spectra
@@ -40,6 +41,7 @@ from depth_deblur_ros.core.templates import (
     REACH,
     template_table,
 )
+from depth_deblur_ros.core.threads import on_threads, SHARED
 from numba import njit, prange
 import numpy as np
 
@@ -48,7 +50,7 @@ CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sen
 EVEN = 0.1  # of S: keeps faint templates from winning by their small norm
 MAX_PATCHES = 400
 CHUNK = 256  # motions that are scored together
-FEW = 2 * CHUNK  # motions that one thread scores sooner than it wakes another
+FEW = 2 * CHUNK  # motions for which numba's own threads are not worth it
 SPARSE = 4  # every so many-th pixel of a patch tells its depth
 
 
@@ -162,18 +164,38 @@ def thinned(evidence: Evidence) -> Evidence:
 
 def scores(qs: Vector, evidence: Evidence) -> Vector:
     """Give S of the motions q (m, 6) or (m, 9) [px]."""
-    e, (count, size) = evidence, qs.shape
-    padded = np.zeros((size, -(-count // WIDTH) * WIDTH), np.float32)
+    e = evidence
+    told, (c, d) = _laid_out(qs, e)
+    tables = (e.match.reshape(len(e.match), -1), e.energy.reshape(-1), e.sag.reshape(-1))
+    if len(c) <= FEW:
+        on_threads(_add_some, len(c) // WIDTH, *tables, *told, c, d)
+    else:
+        _add_all(*tables, *told, c, d)  # type: ignore[call-arg]
+    return _score(c, d, len(qs))
+
+
+def rough_scores(qs: Vector, evidence: Evidence) -> Vector:
+    """Give about S, by the nearest templates: enough to tell which motions are worth the rest."""
+    e = evidence
+    told, (c, d) = _laid_out(qs, e)
+    tables = e.match.reshape(len(e.match), -1), e.energy.reshape(-1)
+    on_threads(_add_roughly, len(c) // WIDTH, *tables, *told, c, d)
+    return _score(c, d, len(qs))
+
+
+def _laid_out(
+    qs: Vector, e: Evidence
+) -> tuple[tuple[FloatImage, ...], tuple[FloatImage, FloatImage]]:
+    """Give q by components, w and J G, and the sums of C and D of whole blocks of motions."""
+    count, size = qs.shape
+    padded = np.zeros((size, whole_blocks(count)), np.float32)
     padded[:, :count] = qs.T
     c, d = np.zeros(padded.shape[1], np.float32), np.full(padded.shape[1], EVEN, np.float32)
-    match = e.match.reshape(len(e.match), -1)
     flows = np.ascontiguousarray(e.flow_of_q[..., :size]).reshape(-1, 2 * size)
-    table = (e.energy.reshape(-1), e.sag.reshape(-1))
-    told = (padded.reshape(-1), match, *table, e.weight, flows, c, d)
-    if c.size <= FEW:
-        _add_some(0, c.size, *told)
-    else:
-        _add_all(*told)
+    return (padded.reshape(-1), e.weight, flows), (c, d)
+
+
+def _score(c: FloatImage, d: FloatImage, count: int) -> Vector:
     return np.asarray(-c[:count].astype(np.float64) / np.sqrt(d[:count]))
 
 
@@ -201,17 +223,23 @@ def _between(table, p, w):  # type: ignore[no-untyped-def]
     return w[0] * here + w[1] * right + w[2] * below + w[3] * beyond
 
 
+@njit(cache=True, nogil=True, inline='always')
+def _place(flow, q, i, step):  # type: ignore[no-untyped-def]
+    """Give where sixteen motions' flows of a patch lie in a table, and > 0 where they do."""
+    zero, reach = splat(np.float32(0)), splat(np.float32(REACH))
+    half = len(flow) // 2
+    u, v = _flow(flow[:half], q, i, step), _flow(flow[half:], q, i, step)
+    u, v = where_positive(v, u, zero - u), larger(v, zero - v)
+    inside = reach - larger(v, larger(u, zero - u))
+    return where_positive(inside, u + reach, zero), where_positive(inside, v, zero), inside
+
+
 @njit(cache=True, nogil=True)
-def _add_patch(first, end, q, match, energy, sag, weight, flow, c, d):  # type: ignore[no-untyped-def]
+def _add_patch(first, end, match, energy, sag, q, weight, flow, c, d):  # type: ignore[no-untyped-def]
     """Add what one patch says about motions `first` to `end` to c and d."""
-    zero, one, reach = splat(np.float32(0)), splat(np.float32(1)), splat(np.float32(REACH))
-    w = splat(weight)
+    zero, one, w = splat(np.float32(0)), splat(np.float32(1)), splat(weight)
     for i in range(first, end, WIDTH):
-        half = len(flow) // 2
-        u, v = _flow(flow[:half], q, i, c.size), _flow(flow[half:], q, i, c.size)
-        u, v = where_positive(v, u, zero - u), larger(v, zero - v)
-        inside = reach - larger(v, larger(u, zero - u))
-        u, v = where_positive(inside, u + reach, zero), where_positive(inside, v, zero)
+        u, v, inside = _place(flow, q, i, c.size)
         x, y = whole(u), whole(v)
         a, b = u - x, v - y
         both = a * b
@@ -226,15 +254,37 @@ def _add_patch(first, end, q, match, energy, sag, weight, flow, c, d):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _add_some(first, end, q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
+def _add_patches(first, end, match, energy, sag, q, weight, flows, c, d):  # type: ignore[no-untyped-def]
     """Add the patches' C and D at motions `first` to `end` of q (n * m,); flat but B first."""
     for b in range(len(weight)):
-        _add_patch(first, end, q, match[b], energy, sag, weight[b], flows[b], c, d)
+        _add_patch(first, end, match[b], energy, sag, q, weight[b], flows[b], c, d)
+
+
+@njit(**SHARED)
+def _add_some(first, end, match, energy, sag, q, weight, flows, c, d):  # type: ignore[no-untyped-def]
+    _add_patches(first * WIDTH, end * WIDTH, match, energy, sag, q, weight, flows, c, d)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _add_all(q, match, energy, sag, weight, flows, c, d):  # type: ignore[no-untyped-def]
+def _add_all(match, energy, sag, q, weight, flows, c, d):  # type: ignore[no-untyped-def]
     """Add the patches' C and D at motions q (n * m,) to c and d (m,)."""
     for k in prange(-(-c.size // CHUNK)):
         end = min((k + 1) * CHUNK, c.size)
-        _add_some(k * CHUNK, end, q, match, energy, sag, weight, flows, c, d)
+        _add_patches(k * CHUNK, end, match, energy, sag, q, weight, flows, c, d)
+
+
+@njit(**SHARED)
+def _add_roughly(first, end, match, energy, q, weight, flows, c, d):  # type: ignore[no-untyped-def]
+    """Add C and D of the nearest templates at sixteen motions each, from `first` to `end`."""
+    zero, half = splat(np.float32(0)), splat(np.float32(0.5))
+    both = np.empty(2 * energy.size, np.float32)
+    for b in range(len(weight)):
+        w, flow = weight[b], flows[b]
+        for k in range(energy.size):
+            both[2 * k], both[2 * k + 1] = w * match[b, k], w * energy[k]
+        for i in range(first * WIDTH, end * WIDTH, WIDTH):
+            u, v, inside = _place(flow, q, i, c.size)
+            place = whole(u + half) + whole(v + half) * splat(np.float32(ACROSS))
+            found, own = pairs(both, place + place)
+            store(c, i, load(c, i) + where_positive(inside, found, zero))
+            store(d, i, load(d, i) + where_positive(inside, own, splat(w)))

@@ -13,15 +13,24 @@ Notation: q (6,) or (9,), with turns that rows see differently, motion in pixels
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
-from depth_deblur_ros.core.evidence import Evidence, gather_spectra, scores, Spectra, thinned
+from depth_deblur_ros.core.evidence import (
+    Evidence,
+    gather_spectra,
+    rough_scores,
+    scores,
+    Spectra,
+    thinned,
+)
 from depth_deblur_ros.core.templates import PATCH, REACH
 import numpy as np
+
+Judge = Callable[[Vector, Evidence], Vector]  # scores of motions (m, n)
 
 SCALES = (1, 2, 4)
 WITNESS = 1.75  # the scale of a small picture, whose half holds too few patches; has no vote
@@ -36,8 +45,8 @@ SHARE = {
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
 ROLLING_COST = 0.07  # of S per squared change from first to last row over the squared length
 FEW = 4  # patches; a coarse scale with less has no vote
-MANY = 40  # patches of a scale, of which half are heard on all proposals
-HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that all patches judge; that seeds are of
+MANY = 40  # patches of a scale, of which half are heard on all proposals, roughly
+HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that are judged exactly; that seeds are of
 SEEDS = 8  # distinct motions that each scale refines
 NEAR = 3.0  # px; how wide it is searched around a guess
 DEEPER = 1.08  # times as deep bands make twice a motion likelier
@@ -180,14 +189,14 @@ def _whole(grey: FloatImage) -> FloatImage:
     return np.clip(1 - 2 * burnt, 0, 1)
 
 
-def common_score(qs: Vector, scales: list[Scale]) -> Vector:
+def common_score(qs: Vector, scales: list[Scale], judge: Judge = scores) -> Vector:
     """Give the score (m,) of motions q (m, n) over all scales; parallax and rows have a price."""
     total = PARALLAX_COST * (qs[:, 4] ** 2 + qs[:, 5] ** 2)
     if qs.shape[1] > 6:
         length = np.square(qs[:, :4]).sum(1)
         total += ROLLING_COST * np.square(qs[:, 6:]).sum(1) / (1 + length)
     for scale in scales:
-        total = total + SHARE[scale.factor] * scores(qs, scale.evidence)
+        total = total + SHARE[scale.factor] * judge(qs, scale.evidence)
     return np.asarray(total)
 
 
@@ -265,20 +274,21 @@ def _short() -> Vector:
 
 def _seeds(scale: Scale) -> Vector:
     """Pick the best proposals (n, 6) of a scale that differ by more than 4 of its pixels."""
-    qs = scale.factor * _proposals()
-    if len(scale.evidence.weight) >= MANY:
-        qs = _best(qs, [Scale(scale.factor, thinned(scale.evidence))], HEARD_TWICE)
-    qs = _best(qs, [scale], CANDIDATES)
+    qs, heard = scale.factor * _proposals(), scale.evidence
+    if len(heard.weight) >= MANY:
+        heard = thinned(heard)
+    qs = _best(qs, [Scale(scale.factor, heard)], HEARD_TWICE, rough_scores)
+    left = np.ascontiguousarray(_best(qs, [scale], CANDIDATES).T)
     chosen: list[Vector] = []
-    while len(qs) and len(chosen) < SEEDS:
-        chosen.append(qs[0])
-        qs = qs[np.abs(qs - qs[0]).max(1) > 4 * scale.factor]
+    while left.size and len(chosen) < SEEDS:
+        chosen.append(left[:, 0])
+        left = left[:, np.abs(left - left[:, :1]).max(0) > 4 * scale.factor]
     return np.array(chosen)
 
 
-def _best(qs: Vector, scales: list[Scale], count: int) -> Vector:
+def _best(qs: Vector, scales: list[Scale], count: int, judge: Judge = scores) -> Vector:
     """Give the motions that the scales like best, the best first."""
-    values = common_score(qs, scales)
+    values = common_score(qs, scales, judge)
     some = np.argpartition(values, count)[:count] if count < len(qs) else np.arange(len(qs))
     return np.asarray(qs[some[np.argsort(values[some], kind='stable')]])
 
