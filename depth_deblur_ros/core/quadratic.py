@@ -99,6 +99,8 @@ def conjugate_gradients(
         if rz <= 0:
             break
         dq, rq, qq = problem.normal(d, r, q)
+        if dq <= 0:  # nothing is trusted and nothing holds together
+            break
         step = rz / dq
         # What will be left is known before the step, which can turn d on its way.
         left = max(0.0, rz - step * (2 * rq - step * qq))
