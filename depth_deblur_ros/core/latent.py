@@ -29,7 +29,7 @@ from depth_deblur_ros.core.quadratic import conjugate_gradients, reweighted
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 
-SHOWN = 3.5  # px of mean blur for which half of a size is worth it; of the full one it always is
+SHOWN = 3.0  # px of mean blur for which half of a size is worth it; of the full one it always is
 SATURATED = 0.99  # stored values above may stand for any amount of light
 # px of the longest blur, and of a block's own, from one instant of the exposure to the next, and
 # what noise adds to them in brief
