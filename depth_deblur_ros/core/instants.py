@@ -56,7 +56,7 @@ def laid_out(seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32
     far: px, the longest displacement along an axis.
     """
     height, samples, width = seen.shape
-    # Sixteen bits for the nearest: the longest displacement is off by a hundred thousandth.
+    # In sixteen bits the longest displacement is off by less than a hundred thousandth.
     unit = max(float(seen.max()), 1e-30) / MOST
     flow = flow.copy()
     flow[width:].reshape(height, ROW)[:, OF_NEARNESS:] *= np.float32(unit)
@@ -78,34 +78,34 @@ def flow_at(y, k, flow, width):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _count(y, k, seen, flow, unit, spacing, samples, width):  # type: ignore[no-untyped-def]
-    """Give how many instants a block has."""
+def _count(y, k, seen, flow, scale, spacing, samples, width):  # type: ignore[no-untyped-def]
+    """Give how many instants a block has; scale: what 1/m is in parts of `flow`."""
     if spacing == 0:
         return samples
     ax, ay, bx, by = flow_at(y, k, flow, width)
     at, square = y * samples * width + k * WIDTH, splat(np.float32(0))
     for i in range(samples):
-        w = splat(unit) * load(seen, at + i * width)
+        w = splat(scale) * load(seen, at + i * width)
         dx, dy = ax + w * bx, ay + w * by
         square = larger(square, dx * dx + dy * dy)
     return min(max(math.ceil(math.sqrt(greatest(square)) / spacing), FEWEST), samples)
 
 
 @njit(**SHARED)
-def _lay_out(first, end, seen, flow, unit, spacing, far, nearness, shares, cells):  # type: ignore[no-untyped-def]
+def _lay_out(first, end, seen, flow, scale, spacing, far, nearness, shares, cells):  # type: ignore[no-untyped-def]
     """Keep what each block sees at its own instants, and where it begins to read, how far."""
     _, samples, width = seen.shape
     flat, kept, half = seen.reshape(-1), nearness.reshape(-1), splat(np.float32(0.5))
     for y in range(first, end):
         for k in range(width // WIDTH):
-            count = _count(y, k, flat, flow, unit, spacing, samples, width)
+            count = _count(y, k, flat, flow, scale, spacing, samples, width)
             shares[y, k] = 1 / count
             ax, ay, bx, by = flow_at(y, k, flow, width)
             at = (y * (width // WIDTH) + k) * samples * WIDTH
             for i in range(count):
                 nearest = (2 * i + 1) * samples // (2 * count)
                 w = load(flat, (y * samples + nearest) * width + k * WIDTH)
-                w, back = whole(splat(unit) * w + half), splat(back_at(i, shares[y, k]))
+                w, back = whole(splat(scale) * w + half), splat(back_at(i, shares[y, k]))
                 store_whole(kept, at + i * WIDTH, w)
                 dx, dy = _displacement(ax, bx, w, back), _displacement(ay, by, w, back)
                 cells[y, k, i, 0], cells[y, k, i, 2] = _span(dx, far)
