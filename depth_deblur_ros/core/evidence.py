@@ -164,9 +164,8 @@ def thinned(evidence: Evidence) -> Evidence:
 
 def scores(qs: Vector, evidence: Evidence) -> Vector:
     """Give S of the motions q (m, 6) or (m, 9) [px]."""
-    e = evidence
-    told, (c, d) = _laid_out(qs, e)
-    tables = (e.match.reshape(len(e.match), -1), e.energy.reshape(-1), e.sag.reshape(-1))
+    match, energy, told, (c, d) = _laid_out(qs, evidence)
+    tables = match, energy, evidence.sag.reshape(-1)
     if len(c) <= FEW:
         on_threads(_add_some, len(c) // WIDTH, *tables, *told, c, d)
     else:
@@ -176,23 +175,22 @@ def scores(qs: Vector, evidence: Evidence) -> Vector:
 
 def rough_scores(qs: Vector, evidence: Evidence) -> Vector:
     """Give about S, by the nearest templates: enough to tell which motions are worth the rest."""
-    e = evidence
-    told, (c, d) = _laid_out(qs, e)
-    tables = e.match.reshape(len(e.match), -1), e.energy.reshape(-1)
-    on_threads(_add_roughly, len(c) // WIDTH, *tables, *told, c, d)
+    match, energy, told, (c, d) = _laid_out(qs, evidence)
+    on_threads(_add_roughly, len(c) // WIDTH, match, energy, *told, c, d)
     return _score(c, d, len(qs))
 
 
 def _laid_out(
     qs: Vector, e: Evidence
-) -> tuple[tuple[FloatImage, ...], tuple[FloatImage, FloatImage]]:
-    """Give q by components, w and J G, and the sums of C and D of whole blocks of motions."""
+) -> tuple[FloatImage, FloatImage, tuple[FloatImage, ...], tuple[FloatImage, FloatImage]]:
+    """Give C, D; q by components, w, J G; and the sums of C and D of whole blocks of motions."""
     count, size = qs.shape
     padded = np.zeros((size, whole_blocks(count)), np.float32)
     padded[:, :count] = qs.T
     c, d = np.zeros(padded.shape[1], np.float32), np.full(padded.shape[1], EVEN, np.float32)
     flows = np.ascontiguousarray(e.flow_of_q[..., :size]).reshape(-1, 2 * size)
-    return (padded.reshape(-1), e.weight, flows), (c, d)
+    match, energy = e.match.reshape(len(e.match), -1), e.energy.reshape(-1)
+    return match, energy, (padded.reshape(-1), e.weight, flows), (c, d)
 
 
 def _score(c: FloatImage, d: FloatImage, count: int) -> Vector:

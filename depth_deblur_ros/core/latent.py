@@ -111,7 +111,7 @@ def restore_coarse_to_fine(
     steps = replace(steps, inner=math.ceil(worth * steps.inner), early=1 - EARLIER * haste)
     spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     length = blur_length(motion.by_rows, depth, camera)
-    sizes = 1 + max(0, math.floor(math.log2(max(length, SHOWN) / SHOWN)))
+    sizes = 1 + math.floor(math.log2(max(length / SHOWN, 1)))
     effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste, sizes)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)

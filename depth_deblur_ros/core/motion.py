@@ -250,6 +250,6 @@ def _leant(lean, latent, place, c, weights):  # type: ignore[no-untyped-def]
     one = np.uintp(1)
     top, below = latent[y, x, c], latent[y + one, x, c]
     dt, db = latent[y, x + one, c] - top, latent[y + one, x + one, c] - below
-    dx, dy = tx * ((1 - v) * dt + v * db), ty * (below + u * db - top - u * dt)
-    value = share * (top + u * dt + v * (below + u * db - top - u * dt))
+    across, down = (1 - v) * dt + v * db, below + u * db - top - u * dt
+    value, dx, dy = share * (top + u * dt + v * down), tx * across, ty * down
     return lean[0] + value, lean[1] - dx, lean[2] - w * dx, lean[3] - dy, lean[4] - w * dy

@@ -43,18 +43,19 @@ class Quadratic:
         self._sum(strips, latent, latent, r, -1)
         return r
 
-    def normal(self, d: FloatImage, r: FloatImage, q: FloatImage) -> Vector:
+    def normal(self, r: FloatImage) -> Vector:
         """
-        Write the normal equations' matrix times d into q.
+        Write the normal equations' matrix times d into q; d, q = sweep.directions.
 
         Give <d, q>, and <r, q> and <q, q> preconditioned.
         """
+        d, q = self.sweep.directions
         blurred = self.sweep.gather(d, self.trust, self.sweep.taken)
         return self._sum(self.sweep.scatter(blurred), d, r, q, 1)
 
     def advance(self, latent: FloatImage, r: FloatImage, step: float, turn: float) -> float:
         """
-        Go along d = directions[0]: latent + step d, r - step q, then d = r / ease + turn d.
+        Go along d: latent + step d, r - step q, then d = r / ease + turn d; d, q as in `normal`.
 
         Gives <r, r> preconditioned.
         """
@@ -91,20 +92,18 @@ def conjugate_gradients(
 
     slope: minus the gradient. Both are written over, and latent is given back.
     """
-    r = slope
-    d, q = problem.sweep.directions
-    d[:] = 0
-    rz = problem.advance(latent, r, 0, 0)
+    problem.sweep.directions[0] = 0
+    rz = problem.advance(latent, slope, 0, 0)
     for _ in range(limit):
         if rz <= 0:
             break
-        dq, rq, qq = problem.normal(d, r, q)
+        dq, rq, qq = problem.normal(slope)
         if dq <= 0:  # nothing is trusted and nothing holds together
             break
         step = rz / dq
         # What will be left is known before the step, which can turn d on its way.
         left = max(0.0, rz - step * (2 * rq - step * qq))
-        rz = problem.advance(latent, r, step, left / rz)
+        rz = problem.advance(latent, slope, step, left / rz)
     return latent
 
 
