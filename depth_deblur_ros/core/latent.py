@@ -22,10 +22,11 @@ import cv2
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.compression import block_sigma
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, MIN_SIDE, Motion
+from depth_deblur_ros.core.descent import conjugate_gradients
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.light import light_ease, light_from_stored, stored_from_light
 from depth_deblur_ros.core.pyramid import Level, scaled_level
-from depth_deblur_ros.core.quadratic import conjugate_gradients, reweighted
+from depth_deblur_ros.core.quadratic import reweighted
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 

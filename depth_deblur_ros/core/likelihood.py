@@ -25,9 +25,10 @@ import math
 
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion, Vector
+from depth_deblur_ros.core.descent import conjugate_gradients
 from depth_deblur_ros.core.light import light_slope, stored_from_light
 from depth_deblur_ros.core.motion import blur_and_slope
-from depth_deblur_ros.core.quadratic import conjugate_gradients, Quadratic, reweighted
+from depth_deblur_ros.core.quadratic import Quadratic, reweighted
 from depth_deblur_ros.core.sums import add_noise, multiply, squares
 from depth_deblur_ros.core.sweep import Sweep
 from depth_deblur_ros.core.threads import on_threads

@@ -1,8 +1,8 @@
 """
-One reweighting of the image step: a quadratic problem, solved by conjugate gradients.
+One reweighting of the image step: a quadratic problem; descent.py solves it.
 
 Notation as in latent.py, (7) of docs/method.md. Each link between two neighbours pulls with a
-weight that the present image gives it, the steps are preconditioned with l'^2.
+weight that the present image gives it.
 [KF09] Krishnan & Fergus, NIPS 2009: the hyper-Laplacian prior. [IRLS] Levin et al., SIGGRAPH 2007.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from depth_deblur_ros.core.data import FloatImage, Vector
+from depth_deblur_ros.core.data import FloatImage
 from depth_deblur_ros.core.lanes import load, smaller, splat, store, total, WIDTH
 from depth_deblur_ros.core.light import light_ease
 from depth_deblur_ros.core.powers import over_three_fifths
@@ -39,40 +39,10 @@ class Quadratic:
     def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
         """Give minus the gradient at a latent image; missing = B - A latent."""
         strips = self.sweep.scatter(np.multiply(self.trust, missing, out=self.sweep.taken))
-        r = np.zeros_like(latent)
-        self._sum(strips, latent, latent, r, -1)
+        r, products = np.zeros_like(latent), np.empty((latent.shape[1], 3), np.float32)
+        told = self.links, self.ease, np.float32(-1), r, products
+        on_threads(sum_rows, len(products), strips, missing.shape[1], latent, latent, *told)
         return r
-
-    def normal(self, r: FloatImage) -> Vector:
-        """
-        Write the normal equations' matrix times d into q; d, q = sweep.directions.
-
-        Give <d, q>, and <r, q> and <q, q> preconditioned.
-        """
-        d, q = self.sweep.directions
-        blurred = self.sweep.gather(d, self.trust, self.sweep.taken)
-        return self._sum(self.sweep.scatter(blurred), d, r, q, 1)
-
-    def advance(self, latent: FloatImage, r: FloatImage, step: float, turn: float) -> float:
-        """
-        Go along d: latent + step d, r - step q, then d = r / ease + turn d; d, q as in `normal`.
-
-        Gives <r, r> preconditioned.
-        """
-        products = np.zeros(r.shape[1], np.float32)
-        told = *self.sweep.directions, self.ease, np.float32(step), np.float32(turn), products
-        on_threads(_advance, len(products), latent, r, *told)
-        return float(products.sum(dtype=np.float64))
-
-    def _sum(
-        self, strips: FloatImage, x: FloatImage, r: FloatImage, out: FloatImage, sign: float
-    ) -> Vector:
-        """Write strips of A' and sign times the prior's part of x; give products as `normal`."""
-        products = np.zeros((x.shape[1], 3), np.float32)
-        rows = self.trust.shape[1]
-        told = strips, rows, x, r, self.links, self.ease, np.float32(sign)
-        on_threads(_sum_rows, len(products), *told, out, products)
-        return np.asarray(products.sum(0, dtype=np.float64))
 
 
 def reweighted(
@@ -82,29 +52,6 @@ def reweighted(
     links = np.zeros((4, *stored.shape[1:]), np.float32)
     on_threads(_link_weights, stored.shape[1], stored, weight, links)
     return Quadratic(sweep, trust, links, light_ease(stored, transfer))
-
-
-def conjugate_gradients(
-    problem: Quadratic, latent: FloatImage, slope: FloatImage, limit: int
-) -> FloatImage:
-    """
-    Solve from latent by `limit` steps, preconditioned with l'^2.
-
-    slope: minus the gradient. Both are written over, and latent is given back.
-    """
-    problem.sweep.directions[0] = 0
-    rz = problem.advance(latent, slope, 0, 0)
-    for _ in range(limit):
-        if rz <= 0:
-            break
-        dq, rq, qq = problem.normal(slope)
-        if dq <= 0:  # nothing is trusted and nothing holds together
-            break
-        step = rz / dq
-        # What will be left is known before the step, which can turn d on its way.
-        left = max(0.0, rz - step * (2 * rq - step * qq))
-        rz = problem.advance(latent, slope, step, left / rz)
-    return latent
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -170,8 +117,12 @@ def _add_prior(y, x, r, links, ease, sign, out, products, room):  # type: ignore
 
 
 @njit(**SHARED)
-def _sum_rows(first, end, strips, rows, x, r, links, ease, sign, out, products):  # type: ignore[no-untyped-def]
-    """Write strips of A' (of `rows` rows of B) and sign times the prior's part of x into out."""
+def sum_rows(first, end, strips, rows, x, r, links, ease, sign, out, products):  # type: ignore[no-untyped-def]
+    """
+    Write strips of A' (of `rows` rows of B) and sign times the prior's part of x into out.
+
+    products (h, 3) of each row: <x, out>; <r, out> and <out, out> preconditioned.
+    """
     high = out.shape[1]
     count, _, depth, _ = strips.shape
     wide = out.shape[2]
@@ -187,18 +138,3 @@ def _sum_rows(first, end, strips, rows, x, r, links, ease, sign, out, products):
                         out[c, y, i] += strips[k, c, j, i]
         room = np.empty(WIDTH, np.float32)
         _add_prior(y, x, r, links, ease, sign, out, products, room)
-
-
-@njit(fastmath=True, **SHARED)
-def _advance(first, end, latent, r, d, q, ease, step, turn, products):  # type: ignore[no-untyped-def]
-    width = r.shape[2]
-    for y in range(first, end):
-        s = np.float32(0)
-        for c in range(3):
-            for x in range(width):
-                latent[c, y, x] += step * d[c, y, x]
-                left = r[c, y, x] - step * q[c, y, x]
-                z = left / ease[c, y, x]
-                r[c, y, x], d[c, y, x] = left, z + turn * d[c, y, x]
-                s += left * z
-        products[y] = s

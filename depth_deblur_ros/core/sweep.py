@@ -37,6 +37,7 @@ from depth_deblur_ros.core.threads import on_threads, SHARED, threads_here
 from numba import njit
 import numpy as np
 
+STRIPS = 2  # of the adjoint for each thread, so that a faster one does more
 GUARD = 2  # px beyond the margin, so that neighbours of what is read exist in every plane
 
 
@@ -89,7 +90,7 @@ class Sweep:
     ) -> FloatImage:
         blurred = np.empty_like(own) if out is None else out
         rows = self.blurred_shape[1]
-        on_threads(_gather, rows, latent, own, less, blurred, *self._parts())
+        on_threads(gather_rows, rows, latent, own, less, blurred, *self.parts())
         return blurred
 
     @cached_property
@@ -104,15 +105,16 @@ class Sweep:
 
     @cached_property
     def strips(self) -> FloatImage:
-        """Room for what each thread of `scatter` writes: (n, 3, rows, w)."""
+        """Room for what `scatter` writes apart: (n, 3, rows, w)."""
         _, height, _ = self.blurred_shape
-        count = min(threads_here(), height)
+        threads = threads_here()
+        count = min(STRIPS * threads, height) if threads > 1 else 1
         _, _, wide = self.latent_shape
         return np.empty((count, 3, math.ceil(height / count) + 2 * self.room, wide), np.float32)
 
     def scatter(self, blurred: FloatImage) -> FloatImage:
         """Spread blurred planes over `strips`; row j of strip k of n: latent row k H // n + j."""
-        on_threads(scatter_rows, len(self.strips), blurred, self.strips, *self._parts())
+        on_threads(scatter_rows, len(self.strips), blurred, self.strips, *self.parts())
         return self.strips
 
     def adjoint(self, blurred: FloatImage) -> FloatImage:
@@ -126,7 +128,8 @@ class Sweep:
             latent[:, first : first + rows] += strip[:, :rows]
         return latent
 
-    def _parts(self) -> tuple[Any, ...]:
+    def parts(self) -> tuple[Any, ...]:
+        """Give what the kernels are told of A."""
         told = self.layout
         return told.nearness, told.flow, told.shares, told.cells, self.far, self.room
 
@@ -207,7 +210,8 @@ def _gather_row(y, latent, own, less, blurred, data, far, room, sizes):  # type:
 
 
 @njit(**SHARED)
-def _gather(first, end, latent, own, less, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
+def gather_rows(first, end, latent, own, less, blurred, nearness, flow, shares, cells, far, room):  # type: ignore[no-untyped-def]
+    """Write rows of own times A L, or less A L."""
     height, blocks, samples, _ = nearness.shape
     width = blocks * WIDTH
     sizes = (height, samples, width, latent.shape[1], latent.shape[2])

@@ -17,7 +17,8 @@ from queue import Empty, SimpleQueue
 from threading import local, Thread
 from typing import Any
 
-from numba import config, get_num_threads, njit, set_num_threads, types
+from depth_deblur_ros.core.crew import Board, dismiss, empty_board, sched_yield
+from numba import config, get_num_threads, njit, set_num_threads
 from numba.core.compiler import Compiler
 import numpy as np
 
@@ -44,9 +45,6 @@ SHARED: dict[str, Any] = {
 }
 
 
-_sched_yield = types.ExternalFunction('sched_yield', types.int32())
-
-
 @njit(cache=True, nogil=True)
 def _rest(turns):  # type: ignore[no-untyped-def]
     """Say that a share is done; return when the next is there, or after a while."""
@@ -56,7 +54,7 @@ def _rest(turns):  # type: ignore[no-untyped-def]
         asked += turns[ASKED] != turns[DONE]
         if asked > HEAD_START:
             break
-        _sched_yield()
+        sched_yield()
 
 
 @njit(cache=True, nogil=True)
@@ -65,7 +63,7 @@ def _await(turns):  # type: ignore[no-untyped-def]
     for _ in range(PATIENCE):
         if turns[ASKED] == turns[DONE]:
             break
-        _sched_yield()
+        sched_yield()
 
 
 class _Worker(Thread):
@@ -174,6 +172,26 @@ def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     for worker in workers:
         worker.ask(share)
     outcomes = [_outcome(share), *(worker.outcome() for worker in workers)]
+    _idle.extend(workers)
+    for error in filter(None, outcomes):
+        raise error
+
+
+def with_crew(lead: Callable[..., None], follow: Callable[..., None], *data: Any) -> None:
+    """
+    Call lead(board, *data), and follow(board, *data) on the other threads that numba may use.
+
+    Both are compiled loops that share their work by a board (crew.py); who follows returns when
+    the board says that all is over.
+    """
+    threads = threads_here()
+    board: Board = empty_board(threads)
+    workers = [_worker() for _ in range(1, threads)]
+    for worker in workers:
+        worker.ask(partial(follow, board, *data))
+    outcomes = [_outcome(partial(lead, board, *data))]
+    dismiss(board)
+    outcomes += [worker.outcome() for worker in workers]
     _idle.extend(workers)
     for error in filter(None, outcomes):
         raise error
