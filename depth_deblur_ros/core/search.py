@@ -46,13 +46,14 @@ PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than paralla
 ROLLING_COST = 0.07  # of S per squared change from first to last row over the squared length
 FEW = 4  # patches; a coarse scale with less has no vote
 MANY = 40  # patches of a scale, of which half are heard on all proposals, roughly
-HEARD_TWICE, CANDIDATES = 8000, 3000  # proposals that are judged exactly; that seeds are of
+HEARD_TWICE, CANDIDATES = 1500, 1000  # proposals that are judged exactly; that seeds are of
 SEEDS = 8  # distinct motions that each scale refines
 NEAR = 3.0  # px; how wide it is searched around a guess
 DEEPER = 1.08  # times as deep bands make twice a motion likelier
 ROOM = 10  # px of templates around the guess, more than the search around it goes
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
+TRIES_OF_SEEDS = 100
 DESCENTS, FLATTEST = 2, 1e-3  # Newton's steps; least share of the largest curvature
 ALONG = (0.2, 0.4, 0.7, 1.0, 1.4)  # of such a step are tried
 LAST_RADIUS = 0.5  # px
@@ -204,7 +205,7 @@ def _search(scales: list[Scale], guess: Vector | None) -> Vector:
     """Let each scale propose and all choose; q (9,)."""
     found = [] if guess is None else [guess[:6]]
     for scale in scales:
-        found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor))
+        found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor, TRIES_OF_SEEDS))
     return _settled(_by_rows(_choose(np.array(found), scales)[None])[0], scales, NEAR)
 
 
@@ -257,12 +258,12 @@ def _choose(qs: Vector, scales: list[Scale]) -> Vector:
 @lru_cache(maxsize=1)
 def _proposals() -> Vector:
     """Give motions (m, 6) [px] over what one scale can see: a grid, and random with parallax."""
-    steps = np.arange(-REACH + 2, REACH - 1, 2.0)
+    steps = np.arange(-REACH + 2, REACH - 1, 4.0)
     grid = np.stack(
         np.meshgrid(steps, steps[steps >= 0], np.linspace(-18, 18, 7), np.linspace(-12, 12, 5)), -1
     ).reshape(-1, 4)
     grid = np.concatenate([grid, np.zeros((len(grid), 2))], 1)
-    random = np.random.default_rng(0).standard_normal((30000, 6)) * (14, 14, 7, 6, 3, 3)
+    random = np.random.default_rng(0).standard_normal((15000, 6)) * (14, 14, 7, 6, 3, 3)
     return np.concatenate([grid, random])
 
 
@@ -300,11 +301,15 @@ def _steps() -> Vector:
     return np.asarray(steps * SHRINK ** np.arange(ROUNDS)[:, None, None])
 
 
-def _refine(qs: Vector, scales: list[Scale], radius: float) -> Vector:
-    """Shrinking random search around each of qs (n, 6 or 9), the same each time; radius [px]."""
+def _refine(qs: Vector, scales: list[Scale], radius: float, count: int = TRIES) -> Vector:
+    """
+    Shrinking random search around each of qs (n, 6 or 9), the same each time.
+
+    radius [px]; count: of the motions that are tried in each round.
+    """
     best, each, size = common_score(qs, scales), np.arange(len(qs)), qs.shape[1]
     for steps in _steps():
-        tries = qs[:, None] + radius * steps[:, :size]
+        tries = qs[:, None] + radius * steps[:count, :size]
         values = common_score(tries.reshape(-1, size), scales).reshape(len(qs), -1)
         k = np.argmin(values, 1)
         better = values[each, k] < best
