@@ -34,6 +34,7 @@ AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 LONGEST_MOVE = 1.0  # px
+NEGLIGIBLE = 0.0075  # share of the blur; a move shorter than that is the last, too
 # What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
 # by a curve follows sRGB's only about, and the parts share what that gets wrong.
 SOFTEST = 10.0
@@ -100,13 +101,14 @@ def _moved(
     parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), pull.start
     bend = FLATTER * bends.sum(0)
+    enough = max(effort.enough, NEGLIGIBLE * length(p))
     for k in range(effort.moves):
         soft = _softening(gs, bends, pull.dissent)
         force = gs.sum(0) / soft + pull.certainty @ (p - pull.start)
         move = -np.linalg.solve(bend / soft + pull.certainty, force)
         move *= min(1.0, LONGEST_MOVE / max(length(move), 1e-9))
         p = p + move
-        if length(move) < effort.enough or k == effort.moves - 1:
+        if length(move) < enough or k == effort.moves - 1:
             break
         last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
