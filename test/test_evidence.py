@@ -5,16 +5,14 @@ from dataclasses import replace
 from depth_deblur_ros.core.data import CameraIntrinsics
 from depth_deblur_ros.core.evidence import (
     _corners,
-    EVEN,
     Evidence,
     gather_spectra,
     MAX_PATCHES,
     motion_axes,
-    rough_scores,
-    scores,
     thinned,
 )
 from depth_deblur_ros.core.geometry import flow
+from depth_deblur_ros.core.scores import EVEN, rough_scores, scores
 from depth_deblur_ros.core.spectra import patch_spectra
 from depth_deblur_ros.core.templates import ACROSS, PATCH, REACH, template_table
 from hypothesis import given, settings

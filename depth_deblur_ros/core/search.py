@@ -13,37 +13,27 @@ Notation: q (6,) or (9,), with turns that rows see differently, motion in pixels
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import lru_cache
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
-from depth_deblur_ros.core.evidence import (
-    Evidence,
-    gather_spectra,
+from depth_deblur_ros.core.evidence import gather_spectra, Spectra, thinned
+from depth_deblur_ros.core.scores import (
+    CLOSE,
+    common_score,
+    PARALLAX_COST,
     rough_scores,
+    Scale,
     scores,
-    Spectra,
-    thinned,
+    SHARE,
+    WITNESS,
 )
+from depth_deblur_ros.core.shrinking import shrink_around
 from depth_deblur_ros.core.templates import PATCH, REACH
 import numpy as np
 
-Judge = Callable[[Vector, Evidence], Vector]  # scores of motions (m, n)
-
 SCALES = (1, 2, 4)
-WITNESS = 1.75  # the scale of a small picture, whose half holds too few patches; has no vote
-CLOSE = 0.5  # the scale at twice the size
-SHARE = {
-    CLOSE: 1.0,
-    1: 1.0,
-    2: 0.5,
-    4: 0.25,
-    WITNESS: 0.7,
-}  # of a scale in the common score: coarse bands are deep but inexact
-PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
-ROLLING_COST = 0.07  # of S per squared change from first to last row over the squared length
 FEW = 4  # patches; a coarse scale with less has no vote
 MANY = 40  # patches of a scale, of which half are heard on all proposals, roughly
 HEARD_TWICE, CANDIDATES = 1500, 1000  # proposals that are judged exactly; that seeds are of
@@ -51,8 +41,6 @@ SEEDS = 8  # distinct motions that each scale refines
 NEAR = 3.0  # px; how wide it is searched around a guess
 DEEPER = 1.08  # times as deep bands make twice a motion likelier
 ROOM = 10  # px of templates around the guess, more than the search around it goes
-SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)  # of the search along each axis of q
-ROUNDS, TRIES, SHRINK = 14, 200, 0.78
 TRIES_OF_SEEDS = 100
 DESCENTS, FLATTEST = 2, 1e-3  # Newton's steps; least share of the largest curvature
 ALONG = (0.2, 0.4, 0.7, 1.0, 1.4)  # of such a step are tried
@@ -64,14 +52,6 @@ CLOSE_SIDES = (240, 320)  # px, rows and columns of the middle that is seen clos
 CLOSE_REACH = 12  # px of templates around no motion, at full scale
 CLOSE_SPREAD = (2.5, 2.5, 1.5, 1.5, 0.5, 0.5)  # px of what is proposed there
 CLOSE_SEEDS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """One scale of the search: its evidence, and by how much the picture is smaller."""
-
-    factor: float
-    evidence: Evidence
 
 
 def find(spectra: Mapping[float, Spectra], guess: Vector | None) -> tuple[Vector, list[Scale]]:
@@ -110,8 +90,12 @@ def find_short(scale: Scale, spectra: Spectra, near: Vector | None) -> tuple[Vec
     around, room = (np.zeros(9), CLOSE_REACH) if near is None else (near, ROOM)
     both = [scale, Scale(CLOSE, spectra.evidence_around(around, round(room / CLOSE)))]
     known = near is not None
-    found = _refine(around[None, :6], both, NEAR) if known else _best(_short(), both, CLOSE_SEEDS)
-    found = _by_rows(_refine(found, both, 1.0))
+    found = (
+        shrink_around(around[None, :6], both, NEAR)
+        if known
+        else _best(_short(), both, CLOSE_SEEDS)
+    )
+    found = _by_rows(shrink_around(found, both, 1.0))
     return found[int(np.argmin(common_score(found, both)))], both
 
 
@@ -190,28 +174,17 @@ def _whole(grey: FloatImage) -> FloatImage:
     return np.clip(1 - 2 * burnt, 0, 1)
 
 
-def common_score(qs: Vector, scales: list[Scale], judge: Judge = scores) -> Vector:
-    """Give the score (m,) of motions q (m, n) over all scales; parallax and rows have a price."""
-    total = PARALLAX_COST * (qs[:, 4] ** 2 + qs[:, 5] ** 2)
-    if qs.shape[1] > 6:
-        length = np.square(qs[:, :4]).sum(1)
-        total += ROLLING_COST * np.square(qs[:, 6:]).sum(1) / (1 + length)
-    for scale in scales:
-        total = total + SHARE[scale.factor] * judge(qs, scale.evidence)
-    return np.asarray(total)
-
-
 def _search(scales: list[Scale], guess: Vector | None) -> Vector:
     """Let each scale propose and all choose; q (9,)."""
     found = [] if guess is None else [guess[:6]]
     for scale in scales:
-        found.extend(_refine(_seeds(scale), [scale], 2.0 * scale.factor, TRIES_OF_SEEDS))
+        found.extend(shrink_around(_seeds(scale), [scale], 2.0 * scale.factor, TRIES_OF_SEEDS))
     return _settled(_by_rows(_choose(np.array(found), scales)[None])[0], scales, NEAR)
 
 
 def _settled(q: Vector, scales: list[Scale], radius: float) -> Vector:
     """Search around one of q (9,), then go down to the bottom; radius [px]."""
-    q = _refine(q[None], scales, radius)[0]
+    q = shrink_around(q[None], scales, radius)[0]
     best = common_score(q[None], scales)[0]
     for _ in range(DESCENTS):
         slope, bend = slope_and_bend(q, scales)
@@ -225,7 +198,7 @@ def _settled(q: Vector, scales: list[Scale], radius: float) -> Vector:
         if told[k] >= best:
             break
         q, best = tries[k], told[k]
-    return np.asarray(_refine(q[None], scales, LAST_RADIUS)[0])
+    return np.asarray(shrink_around(q[None], scales, LAST_RADIUS)[0])
 
 
 def slope_and_bend(q: Vector, scales: list[Scale]) -> tuple[Vector, Vector]:
@@ -278,7 +251,9 @@ def _seeds(scale: Scale) -> Vector:
     qs, heard = scale.factor * _proposals(), scale.evidence
     if len(heard.weight) >= MANY:
         heard = thinned(heard)
-    qs = _best(qs, [Scale(scale.factor, heard)], HEARD_TWICE, rough_scores)
+    price = PARALLAX_COST * np.square(qs[:, 4:]).sum(1)
+    told = price + SHARE[scale.factor] * rough_scores(qs, heard)
+    qs = _lowest(qs, told, HEARD_TWICE)
     left = np.ascontiguousarray(_best(qs, [scale], CANDIDATES).T)
     chosen: list[Vector] = []
     while left.size and len(chosen) < SEEDS:
@@ -287,32 +262,12 @@ def _seeds(scale: Scale) -> Vector:
     return np.array(chosen)
 
 
-def _best(qs: Vector, scales: list[Scale], count: int, judge: Judge = scores) -> Vector:
+def _best(qs: Vector, scales: list[Scale], count: int) -> Vector:
     """Give the motions that the scales like best, the best first."""
-    values = common_score(qs, scales, judge)
+    return _lowest(qs, common_score(qs, scales), count)
+
+
+def _lowest(qs: Vector, values: Vector, count: int) -> Vector:
+    """Give the motions of the lowest values, in their order."""
     some = np.argpartition(values, count)[:count] if count < len(qs) else np.arange(len(qs))
     return np.asarray(qs[some[np.argsort(values[some], kind='stable')]])
-
-
-@lru_cache(maxsize=1)
-def _steps() -> Vector:
-    """Give the steps (ROUNDS, TRIES, 9) of the shrinking search, in units of its radius."""
-    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 9)) * SPREAD
-    return np.asarray(steps * SHRINK ** np.arange(ROUNDS)[:, None, None])
-
-
-def _refine(qs: Vector, scales: list[Scale], radius: float, count: int = TRIES) -> Vector:
-    """
-    Shrinking random search around each of qs (n, 6 or 9), the same each time.
-
-    radius [px]; count: of the motions that are tried in each round.
-    """
-    best, each, size = common_score(qs, scales), np.arange(len(qs)), qs.shape[1]
-    for steps in _steps():
-        tries = qs[:, None] + radius * steps[:count, :size]
-        values = common_score(tries.reshape(-1, size), scales).reshape(len(qs), -1)
-        k = np.argmin(values, 1)
-        better = values[each, k] < best
-        best = np.where(better, values[each, k], best)
-        qs = np.where(better[:, None], tries[each, k], qs)
-    return qs

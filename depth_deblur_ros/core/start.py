@@ -15,20 +15,17 @@ from dataclasses import dataclass, field
 import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Outcome, Vector
-from depth_deblur_ros.core.evidence import motion_axes, scores, Spectra
+from depth_deblur_ros.core.evidence import motion_axes, Spectra
 from depth_deblur_ros.core.geometry import blur_length
+from depth_deblur_ros.core.scores import CLOSE, common_score, Scale, scores, SHARE
 from depth_deblur_ros.core.search import (
     ask_twice,
-    CLOSE,
     close_up,
-    common_score,
     find,
     find_near,
     find_short,
     look,
     look_again,
-    Scale,
-    SHARE,
     slope_and_bend,
 )
 from depth_deblur_ros.core.trust import covariance_from_curvature, Edges
