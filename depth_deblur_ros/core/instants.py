@@ -46,6 +46,7 @@ class Layout:
     flow: FloatImage  # (W' + 8 H,) as `seen.flow_rows` gives it, for inverse depth as above
     shares: FloatImage  # (H, W' / 16) 1 / how many instants a block has: its first ones above
     cells: npt.NDArray[np.int16]  # (H, W' / 16, N, 4) least offset x, y; how many x, y
+    unit: np.float32  # 1/m, one part of nearness
 
 
 def laid_out(seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32) -> Layout:
@@ -65,7 +66,7 @@ def laid_out(seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32
     shares, cells = np.empty(blocks, np.float32), np.empty((*blocks, samples, 4), np.int16)
     told = np.float32(1 / unit), np.float32(spacing), far
     on_threads(_lay_out, height, seen, flow, *told, nearness, shares, cells)
-    return Layout(nearness, flow, shares, cells)
+    return Layout(nearness, flow, shares, cells, np.float32(unit))
 
 
 @njit(cache=True, nogil=True, inline='always')

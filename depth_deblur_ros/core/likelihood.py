@@ -26,8 +26,8 @@ import math
 from depth_deblur_ros.core.blur import blur_operator, BlurOperator
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion, Vector
 from depth_deblur_ros.core.descent import conjugate_gradients
+from depth_deblur_ros.core.leaning import lean
 from depth_deblur_ros.core.light import light_slope, stored_from_light
-from depth_deblur_ros.core.motion import blur_and_slope
 from depth_deblur_ros.core.quadratic import Quadratic, reweighted
 from depth_deblur_ros.core.sums import add_noise, multiply, squares
 from depth_deblur_ros.core.sweep import Sweep
@@ -198,45 +198,28 @@ def _noise(seed: int, height: int, width: int) -> FloatImage:
 
 
 def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
-    """Give g (9,), (16), and J mu (H, W, 9), by rows."""
-    blur, part = found.blur, found.part
-    latent = np.ascontiguousarray(np.moveaxis(blur.latent_part(found.latent), 0, 2))
-    missing, slope = blur_and_slope(blur.motion[:6].astype(np.float64), latent, blur)
-    missing[..., 0] -= part.light
-    missing *= part.trust[..., None] * np.array([1, 0.5, 0.5], np.float32)
-    g = _products(_flat(missing)[..., None], _flat(slope))[:, 0]
-    yn = blur.ray[-len(g) :].astype(np.float64)
-    force = np.concatenate([g.sum(0), yn @ g[:, :3]]) / part.scales.sigma**2
-    own = slope[..., 0, :]
-    return force, np.concatenate([own, yn[:, None, None].astype(own.dtype) * own[..., :3]], -1)
-
-
-def _flat(rows: FloatImage) -> FloatImage:
-    """Give (H, W, 3, ...) as (H, 3 W, ...)."""
-    return rows.reshape(len(rows), -1, *rows.shape[3:])
-
-
-def _products(left: FloatImage, right: FloatImage) -> Vector:
-    """Sum the outer products of left (H, n, I) and right (H, n, J) over each row: (H, I, J)."""
-    sums = np.empty((len(left), left.shape[2], right.shape[2]))
-    on_threads(multiply, len(sums), left, right, sums)
-    return sums
+    """Give g (9,), (16), and J mu (6, H, W'), where rows see no other turn."""
+    blur, weight = found.blur, np.array([1, 0.5, 0.5], np.float32)[:, None, None]
+    light = np.zeros_like(found.problem.trust)
+    light[0, :, : found.part.light.shape[1]] = found.part.light
+    slope, force = lean(blur, found.latent, light, weight * found.problem.trust)
+    force, yn = force.astype(np.float64), blur.ray[-len(force) :].astype(np.float64)
+    g = np.concatenate([force.sum(0), yn @ force[:, :3]])
+    return g / found.part.scales.sigma**2, slope
 
 
 def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
     """Give <J, W (J - A z)> / sigma^2 (9, 9), z how mu answers to a change of p [K75], (17)."""
-    sweep, width, steps = found.blur.sweep, slope.shape[1], found.part.pace.steps
+    sweep, problem = found.blur.sweep, found.problem
     rest = np.empty_like(slope)
-    for first in (0, 3):
-        some = slice(first, first + 3)
-        columns = sweep.blurred_planes(slope[..., some])
-        push = sweep.adjoint(found.problem.trust * columns)
-        z = conjugate_gradients(found.problem, np.zeros_like(push), push, steps)
-        answered = sweep.missing(columns, z)
-        rest[..., some] = np.moveaxis(answered, 0, 2)[:, :width]
+    for half in (slice(0, 3), slice(3, 6)):
+        push = sweep.adjoint(problem.trust * slope[half])
+        z = conjugate_gradients(problem, np.zeros_like(push), push, found.part.pace.steps)
+        sweep.missing(slope[half], z, rest[half])
+    by_row = np.empty((slope.shape[1], 6, 6))
+    on_threads(multiply, len(by_row), slope, problem.trust[0], rest, by_row)
     # Over the length of a blur yn hardly changes: what it weighs is answered alike.
-    yn = found.blur.ray[-len(rest) :, None, None]
-    rest[..., 6:] = yn * rest[..., :3]
-    weighted = found.part.trust[..., None] * slope
-    h = _products(weighted, rest).sum(0)
+    yn = found.blur.ray[-len(by_row) :].astype(np.float64)
+    even, once, twice = (np.einsum('y,yij', yn**k, by_row) for k in range(3))
+    h = np.block([[even, once[:, :3]], [once[:3], twice[:3, :3]]])
     return np.asarray((h + h.T) / 2) / found.part.scales.sigma**2

@@ -65,15 +65,14 @@ def add_noise(noise, links, ease, out):  # type: ignore[no-untyped-def]
                     flat[here + offset + x] -= row[x] * own[x]
 
 
-@njit(**SHARED)
-def multiply(first, end, left, right, sums):  # type: ignore[no-untyped-def]
-    """Sum the outer products of left (H, n, I) and right (H, n, J) over each row: (H, I, J)."""
-    _, count, high = left.shape
-    wide = right.shape[2]
+@njit(fastmath=True, **SHARED)
+def multiply(first, end, left, weight, right, sums):  # type: ignore[no-untyped-def]
+    """Sum weight times left (n, H, W) times right (m, H, W) over each row: (H, n, m)."""
     for y in range(first, end):
-        sums[y] = 0
-        for n in range(count):
-            for i in range(high):
-                one = np.float64(left[y, n, i])
-                for j in range(wide):
-                    sums[y, i, j] += one * right[y, n, j]
+        for i in range(len(left)):
+            one = weight[y] * left[i, y]
+            for j in range(len(right)):
+                other, total = right[j, y], np.float32(0)
+                for x in range(len(one)):
+                    total += one[x] * other[x]
+                sums[y, i, j] = total
