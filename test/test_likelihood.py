@@ -84,8 +84,9 @@ def test_curvature_is_less_than_with_the_image_held():
     """And never negative: part of what a motion changes, another image makes up for."""
     found = posterior(part(TINY, TRUTH), TRUTH)
     _, slope = slope_of(found)
-    weighted = found.part.trust[..., None] * slope
-    held = weighted.reshape(-1, 9).T @ slope.reshape(-1, 9) / found.part.scales.sigma**2
+    yn = found.blur.ray[-slope.shape[1] :, None]
+    flat = np.concatenate([slope, yn * slope[:3]]).reshape(9, -1)
+    held = found.problem.trust[0].ravel() * flat @ flat.T / found.part.scales.sigma**2
     answered = curvature_of(found, slope)
     assert np.linalg.eigvalsh(answered).min() > 0
     assert (np.diag(answered) < np.diag(held)).all()

@@ -34,7 +34,7 @@ AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 LONGEST_MOVE = 1.0  # px
-NEGLIGIBLE = 0.0075  # share of the blur; a move shorter than that is the last, too
+ENOUGH, NEGLIGIBLE = 0.15, 0.0075  # px, share of the blur; the first shorter move is the last
 # What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
 # by a curve follows sRGB's only about, and the parts share what that gets wrong.
 SOFTEST = 10.0
@@ -50,7 +50,6 @@ class Effort:
     pixels: int
     moves: int = 4
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
-    enough: float = 0.15  # px; the first move that is shorter is the last
     doubt: float = 1.0  # times as large is the covariance as that of a refinement to the end
     pace: Pace = field(default_factory=Pace)
 
@@ -101,7 +100,7 @@ def _moved(
     parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), pull.start
     bend = FLATTER * bends.sum(0)
-    enough = max(effort.enough, NEGLIGIBLE * length(p))
+    enough = max(ENOUGH, NEGLIGIBLE * length(p))
     for k in range(effort.moves):
         soft = _softening(gs, bends, pull.dissent)
         force = gs.sum(0) / soft + pull.certainty @ (p - pull.start)

@@ -39,8 +39,9 @@ def lean(
     """
     layout, rows = blur.sweep.layout, data.shape[1]
     own, force = np.empty((6, *data.shape[1:]), np.float32), np.empty((rows, 6), np.float32)
-    told = layout.nearness, layout.flow, layout.shares, layout.cells, layout.unit
-    frame = np.ascontiguousarray(blur.ray[-rows:]), blur.motion[6:8], blur.sweep.far
+    told = layout.nearness, layout.flow, layout.shares, layout.cells
+    ray = np.ascontiguousarray(blur.ray[-rows:])
+    frame = ray, blur.motion[6:8], blur.sweep.far, layout.unit
     on_threads(_lean_rows, rows, latent, data, weight, told, frame, blur.sweep.room, own, force)
     return own, force
 
@@ -116,65 +117,42 @@ def _slopes(sums, xn, yn, focal, unit):  # type: ignore[no-untyped-def]
     return *turn, xn * gy - yn * gx, hx, hy, zero - xn * hx - yn * hy
 
 
-@njit(cache=True, nogil=True)
-def _lean_row(y, latent, data, weight, told, frame, sizes, own, force):  # type: ignore[no-untyped-def]
-    nearness, flow, shares, cells, unit = told
-    ray, focal, far = frame
+@njit(cache=True, nogil=True, inline='always')
+def _block(y, k, latent, told, sizes, far, places):  # type: ignore[no-untyped-def]
+    """Give what `_added` adds up of each plane of a block."""
+    nearness, flow, shares, _ = told
     width, samples, plane, wide, room = sizes
-    many, colour = width // WIDTH, shares.size * WIDTH
-    places, none = np.empty(5 * WIDTH, np.float32), splat(np.float32(0))
-    push = (none, none, none, none, none, none)
-    yn, of_unit = splat(ray[y]), splat(unit)
-    for k in range(many):
-        one, parts = shares[y * many + k], flow_at(y, k, flow, width)
-        r = g = b = (none, none, none, none, none)
-        for i in range(samples):
-            if back_at(i, one) < np.float32(-0.5):
-                break
-            at = (y, k, samples, width)
-            u, v, left, top, columns, rows = aim(
-                at, i, one, parts, (nearness, flow, shares, cells)
-            )
-            w = load_whole(nearness, ((y * many + k) * samples + i) * WIDTH)
-            share, back = splat(one), splat(one * back_at(i, one))
-            p = (y + room + top) * wide + k * WIDTH + room + left
-            if columns == 2 and rows == 2:
-                r = _added(r, _in_cell(latent, p, wide, u, v), share, back, w)
-                g = _added(g, _in_cell(latent, p + plane, wide, u, v), share, back, w)
-                b = _added(b, _in_cell(latent, p + 2 * plane, wide, u, v), share, back, w)
-            elif columns * rows <= MANY:
-                place = u, v, columns, rows
-                r = _added(r, _in_cells(latent, p, wide, place), share, back, w)
-                g = _added(g, _in_cells(latent, p + plane, wide, place), share, back, w)
-                b = _added(b, _in_cells(latent, p + 2 * plane, wide, place), share, back, w)
-            else:
-                apart(places, u, v, left, top, far)
-                r = _added(r, _each(latent, p, wide, places), share, back, w)
-                g = _added(g, _each(latent, p + plane, wide, places), share, back, w)
-                b = _added(b, _each(latent, p + 2 * plane, wide, places), share, back, w)
-        at, xn = y * width + k * WIDTH, load(flow, k * WIDTH)
-        slopes = _slopes(r, xn, yn, focal, of_unit)
-        for j in range(6):
-            store(own, j * colour + at, slopes[j])
-        push = _pushed(push, slopes, load(weight, at) * (r[0] - load(data, at)))
-        at += colour
-        push = _pushed(
-            push,
-            _slopes(g, xn, yn, focal, of_unit),
-            load(weight, at) * (g[0] - load(data, at)),
-        )
-        at += colour
-        push = _pushed(
-            push,
-            _slopes(b, xn, yn, focal, of_unit),
-            load(weight, at) * (b[0] - load(data, at)),
-        )
-    for j in range(6):
-        force[y, j] = total(push[j], places)
+    one, none = shares[y * (width // WIDTH) + k], splat(np.float32(0))
+    parts, start = flow_at(y, k, flow, width), (y * (width // WIDTH) + k) * samples
+    r = g = b = (none, none, none, none, none)
+    for i in range(samples):
+        if back_at(i, one) < np.float32(-0.5):
+            break
+        u, v, left, top, columns, rows = aim((y, k, samples, width), i, one, parts, told)
+        w, share = load_whole(nearness, (start + i) * WIDTH), splat(one)
+        back = splat(one * back_at(i, one))
+        p = (y + room + top) * wide + k * WIDTH + room + left
+        if columns == 2 and rows == 2:
+            r = _added(r, _in_cell(latent, p, wide, u, v), share, back, w)
+            g = _added(g, _in_cell(latent, p + plane, wide, u, v), share, back, w)
+            b = _added(b, _in_cell(latent, p + 2 * plane, wide, u, v), share, back, w)
+        elif columns * rows <= MANY:
+            place = u, v, columns, rows
+            r = _added(r, _in_cells(latent, p, wide, place), share, back, w)
+            g = _added(g, _in_cells(latent, p + plane, wide, place), share, back, w)
+            b = _added(b, _in_cells(latent, p + 2 * plane, wide, place), share, back, w)
+        else:
+            apart(places, u, v, left, top, far)
+            r = _added(r, _each(latent, p, wide, places), share, back, w)
+            g = _added(g, _each(latent, p + plane, wide, places), share, back, w)
+            b = _added(b, _each(latent, p + 2 * plane, wide, places), share, back, w)
+    return r, g, b
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _pushed(push, slopes, missing):  # type: ignore[no-untyped-def]
+def _pushed(push, slopes, value, at, data, weight):  # type: ignore[no-untyped-def]
+    """Add what a plane of a block pushes."""
+    missing = load(weight, at) * (value - load(data, at))
     return (
         push[0] + slopes[0] * missing,
         push[1] + slopes[1] * missing,
@@ -185,12 +163,34 @@ def _pushed(push, slopes, missing):  # type: ignore[no-untyped-def]
     )
 
 
+@njit(cache=True, nogil=True)
+def _lean_row(y, latent, data, weight, told, frame, sizes, own, force):  # type: ignore[no-untyped-def]
+    ray, focal, far, unit = frame
+    width, colour = sizes[0], own.size // 6
+    places, none = np.empty(5 * WIDTH, np.float32), splat(np.float32(0))
+    push = (none, none, none, none, none, none)
+    yn, of_unit = splat(ray[y]), splat(unit)
+    for k in range(width // WIDTH):
+        r, g, b = _block(y, k, latent, told, sizes, far, places)
+        at, xn = y * width + k * WIDTH, load(told[1], k * WIDTH)
+        slopes = _slopes(r, xn, yn, focal, of_unit)
+        for j in range(6):
+            store(own, j * colour + at, slopes[j])
+        push = _pushed(push, slopes, r[0], at, data, weight)
+        slopes = _slopes(g, xn, yn, focal, of_unit)
+        push = _pushed(push, slopes, g[0], at + colour, data, weight)
+        slopes = _slopes(b, xn, yn, focal, of_unit)
+        push = _pushed(push, slopes, b[0], at + 2 * colour, data, weight)
+    for j in range(6):
+        force[y, j] = total(push[j], places)
+
+
 @njit(**SHARED)
-def _lean_rows(first, end, latent, data, weight, told, frame, room, own, force):  # type: ignore[no-untyped-def]
-    nearness, flow, shares, cells, unit = told
+def _lean_rows(first, end, latent, data, weight, layout, frame, room, own, force):  # type: ignore[no-untyped-def]
+    nearness, flow, shares, cells = layout
     _, blocks, samples, _ = nearness.shape
-    flat = nearness.reshape(-1), flow, shares.reshape(-1), cells.reshape(-1), unit
+    told = nearness.reshape(-1), flow, shares.reshape(-1), cells.reshape(-1)
     sizes = blocks * WIDTH, samples, latent[0].size, latent.shape[2], room
     planes = latent.reshape(-1), data.reshape(-1), weight.reshape(-1)
     for y in range(first, end):
-        _lean_row(y, *planes, flat, frame, sizes, own.reshape(-1), force)
+        _lean_row(y, *planes, told, frame, sizes, own.reshape(-1), force)

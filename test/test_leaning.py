@@ -1,0 +1,46 @@
+"""How a blurred image changes with the motion, against its slow twin."""
+
+from depth_deblur_ros.core.blur import blur_operator
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion
+from depth_deblur_ros.core.leaning import lean
+from depth_deblur_ros.core.motion import blur_and_slope
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from pictures import texture
+
+CAMERA = CameraIntrinsics(50.0, 48.0, 20.5, 16.5, 44, 36)
+FAR = 2.0  # m
+
+
+def operator(rng, turn):
+    """Give A of a random motion before a step in depth, of blurs up to 10 px."""
+    depth = np.full((36, 44), FAR, np.float32)
+    depth[rng.integers(36) :, rng.integers(44) :] = rng.uniform(0.7, 2)
+    p = rng.normal(0, 1, 9) * (*[0.05] * 2, turn, *[0.03] * 3, *[0.03] * 3)
+    return blur_operator(Motion.from_vector(p), depth, CAMERA)
+
+
+@given(seed=st.integers(0, 2**32 - 1), turn=st.sampled_from([0.05, 1.5]))
+@settings(max_examples=25)
+def test_it_leans_as_its_slow_twin_does(seed, turn):
+    """A large turn lets blocks read in many cells, and each pixel by itself."""
+    rng = np.random.default_rng(seed)
+    blur = operator(rng, turn)
+    high, wide, _ = blur.latent_shape
+    image = np.stack([texture(int(k), (high, wide)) for k in rng.integers(9, size=3)], 2)
+    image = image.astype(np.float32)
+    planes = np.zeros(blur.sweep.latent_shape, np.float32)
+    blur.latent_part(planes)[:] = np.moveaxis(image, 2, 0)
+    data, weight = rng.random((2, *blur.sweep.blurred_shape), np.float32)
+    weight[:, :, CAMERA.width :] = 0
+    own, force = lean(blur, planes, data, weight)
+    value, slope = blur_and_slope(blur.motion[:6].astype(np.float64), image, blur)
+    # Where rounding moves a read into the next cell, slopes are other ones.
+    size = np.abs(slope[:, :, 0]).max((0, 1))
+    off = np.abs(np.moveaxis(own, 0, 2)[:, : CAMERA.width] - slope[:, :, 0]) / size
+    assert np.quantile(off, 0.99) < 1e-3
+    data, weight = (np.moveaxis(a, 0, 2)[:, : CAMERA.width] for a in (data, weight))
+    pushes = (weight * (value - data))[..., None] * slope
+    expected, room = pushes.sum((1, 2)), np.abs(pushes).sum((1, 2))
+    assert np.quantile(np.abs(force - expected) / room, 0.95) < 5e-3
