@@ -44,7 +44,8 @@ ROOM = 10  # px of templates around the guess, more than the search around it go
 TRIES_OF_SEEDS = 100
 DESCENTS, FLATTEST = 2, 1e-3  # Newton's steps; least share of the largest curvature
 ALONG = (0.2, 0.4, 0.7, 1.0, 1.4)  # of such a step are tried
-LAST_RADIUS = 0.5  # px
+LAST_RADIUS = 0.3  # px
+FARTHEST = 8.0  # times that along what the scales hardly tell
 BEND = 1.0  # px, step of the differences
 _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 SATURATED = 0.98
@@ -178,7 +179,9 @@ def _search(scales: list[Scale], guess: Vector | None) -> Vector:
     """Let each scale propose and all choose; q (9,)."""
     found = [] if guess is None else [guess[:6]]
     for scale in scales:
-        found.extend(shrink_around(_seeds(scale), [scale], 2.0 * scale.factor, TRIES_OF_SEEDS))
+        found.extend(
+            shrink_around(_seeds(scale), [scale], 2.0 * scale.factor, count=TRIES_OF_SEEDS)
+        )
     return _settled(_by_rows(_choose(np.array(found), scales)[None])[0], scales, NEAR)
 
 
@@ -198,7 +201,9 @@ def _settled(q: Vector, scales: list[Scale], radius: float) -> Vector:
         if told[k] >= best:
             break
         q, best = tries[k], told[k]
-    return np.asarray(shrink_around(q[None], scales, LAST_RADIUS)[0])
+    reach = np.minimum(FARTHEST, np.sqrt(steep.max() / steep))
+    spread = vectors * reach @ vectors.T
+    return np.asarray(shrink_around(q[None], scales, LAST_RADIUS, spread=spread)[0])
 
 
 def slope_and_bend(q: Vector, scales: list[Scale]) -> tuple[Vector, Vector]:

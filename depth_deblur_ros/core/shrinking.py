@@ -23,25 +23,38 @@ ROUNDS, TRIES, SHRINK = 14, 200, 0.78
 
 @lru_cache(maxsize=1)
 def _steps() -> Vector:
-    """Give the steps (ROUNDS, TRIES, 9) of the search, in units of its radius."""
-    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 9)) * SPREAD
+    """Give the steps (ROUNDS, TRIES, 9) of the search, in units of its radius and spread."""
+    steps = np.random.default_rng(0).standard_normal((ROUNDS, TRIES, 9))
     return np.asarray(steps * SHRINK ** np.arange(ROUNDS)[:, None, None])
 
 
 def shrink_around(
-    qs: Vector, scales: Sequence[Scale], radius: float, count: int = TRIES
+    qs: Vector,
+    scales: Sequence[Scale],
+    radius: float,
+    *,
+    count: int = TRIES,
+    spread: Vector | None = None,
 ) -> Vector:
     """
     Give the best motions by the common score around each of qs (n, 6 or 9); radius [px].
 
-    count: of the motions that are tried in each round.
+    count: of the motions that are tried in each round; spread (9, 9): how far along each axis of
+    q, SPREAD if none.
     """
     many, size = qs.shape
     qs, best = qs.copy(), common_score(qs, scales)
     found = np.empty(whole_blocks(many * count))
     q = np.zeros(size * found.size, np.float32)
-    steps = radius * _steps()[:, :count, :size]
-    with_crew(_lead, _follow, steps, qs, best, (q, *common(scales, size), found))
+    steps = radius * _steps()[:, :count] @ (np.diag(SPREAD) if spread is None else spread)
+    with_crew(
+        _lead,
+        _follow,
+        np.ascontiguousarray(steps[..., :size]),
+        qs,
+        best,
+        (q, *common(scales, size), found),
+    )
     return qs
 
 

@@ -166,8 +166,10 @@ def _alternated(
 def _grey(image: FloatImage, channels: FloatImage) -> FloatImage:
     if image.ndim == 2:
         return image
-    # Divided last, so that the mean of three equal values is that value, to the bit.
-    return np.asarray(cv2.transform(image, channels) / channels.sum(), np.float32)
+    first, count, others = int(channels.argmax()), channels.sum(), channels.copy()
+    # As one channel and how far the others are from it: the mean of equal values is exact.
+    others[0, first] -= count
+    return np.asarray(image[..., first] + cv2.transform(image, others) / count, np.float32)
 
 
 def _channels(image: FloatImage) -> FloatImage:
