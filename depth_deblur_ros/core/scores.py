@@ -43,7 +43,7 @@ SHARE = {
     WITNESS: 0.7,
 }  # of a scale in the common score: coarse bands are deep but inexact
 PARALLAX_COST = 2e-5  # of S per squared pixel: shifts are likelier than parallax
-ROLLING_COST = 0.07  # of S per squared change from first to last row over the squared length
+ROLLING_COST = 0.06  # of S per squared change from first to last row over the squared length
 EVEN = 0.1  # of S: keeps faint templates from winning by their small norm
 CHUNK = 256  # motions that are scored together
 MOST = 3  # scales that are scored together

@@ -235,14 +235,18 @@ def _choose(qs: Vector, scales: list[Scale]) -> Vector:
 
 @lru_cache(maxsize=1)
 def _proposals() -> Vector:
-    """Give motions (m, 6) [px] over what one scale can see: a grid, and random with parallax."""
+    """
+    Give motions (m, 6) [px] over what one scale can see: a grid, and random with parallax.
+
+    Short ones are known by shallow bands, so they need to be met more closely.
+    """
     steps = np.arange(-REACH + 2, REACH - 1, 4.0)
     grid = np.stack(
         np.meshgrid(steps, steps[steps >= 0], np.linspace(-18, 18, 7), np.linspace(-12, 12, 5)), -1
     ).reshape(-1, 4)
     grid = np.concatenate([grid, np.zeros((len(grid), 2))], 1)
     random = np.random.default_rng(0).standard_normal((15000, 6)) * (14, 14, 7, 6, 3, 3)
-    return np.concatenate([grid, random])
+    return np.concatenate([grid, random, _short()])
 
 
 @lru_cache(maxsize=1)
