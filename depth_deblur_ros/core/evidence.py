@@ -89,6 +89,11 @@ def gather_spectra(
     )
 
 
+def patches_in(size: tuple[int, int]) -> int:
+    """Give how many patches an image of (width, height) px holds."""
+    return len(_corners(size))
+
+
 def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
     """Spread patches evenly over the image, about STEP apart, from border to border."""
     spots = []

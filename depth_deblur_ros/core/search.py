@@ -18,7 +18,7 @@ from functools import lru_cache
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
-from depth_deblur_ros.core.evidence import gather_spectra, Spectra, thinned
+from depth_deblur_ros.core.evidence import gather_spectra, patches_in, Spectra, thinned
 from depth_deblur_ros.core.scores import (
     CLOSE,
     common_score,
@@ -107,13 +107,11 @@ def look(
     whole = _whole(grey)
     found: dict[float, Spectra] = {}
     for factor in SCALES:
-        width, height = camera.width // factor, camera.height // factor
-        if min(width, height) < PATCH:
+        size = camera.width // factor, camera.height // factor
+        if min(size) < PATCH or (found and patches_in(size) < FEW):
             break
-        spectra = _seen((grey, whole, depth), camera.scaled(width, height), axes, cv2.INTER_AREA)
-        if found and len(spectra.weight) < FEW:
-            break
-        found[factor] = spectra
+        images = grey, whole, depth
+        found[factor] = _seen(images, camera.scaled(*size), axes, cv2.INTER_AREA)
     return found
 
 
@@ -121,12 +119,11 @@ def look_again(
     grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
 ) -> dict[float, Spectra]:
     """Look at the scale of the witness, if it holds enough patches."""
-    width, height = int(camera.width / WITNESS), int(camera.height / WITNESS)
-    if min(width, height) < PATCH:
+    size = int(camera.width / WITNESS), int(camera.height / WITNESS)
+    if min(size) < PATCH or patches_in(size) < FEW:
         return {}
     images = (grey, _whole(grey), depth)
-    spectra = _seen(images, camera.scaled(width, height), axes, cv2.INTER_AREA)
-    return {WITNESS: spectra} if len(spectra.weight) >= FEW else {}
+    return {WITNESS: _seen(images, camera.scaled(*size), axes, cv2.INTER_AREA)}
 
 
 def close_up(
@@ -171,7 +168,9 @@ def _scales(spectra: Mapping[float, Spectra], near: Vector | None = None) -> lis
 
 def _whole(grey: FloatImage) -> FloatImage:
     """Give 1 where the pixel and its neighbourhood are not saturated, softly falling to 0."""
-    burnt = cv2.GaussianBlur((grey > SATURATED).astype(np.float32), (0, 0), 3)
+    burnt = (grey > SATURATED).astype(np.float32)
+    if burnt.any():
+        burnt = np.asarray(cv2.GaussianBlur(burnt, (0, 0), 3))
     return np.clip(1 - 2 * burnt, 0, 1)
 
 
