@@ -16,7 +16,7 @@ from depth_deblur_ros.core.data import (
 from depth_deblur_ros.core.geometry import blur_length, flow, rotation_matrix
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
-from numba import get_num_threads
+from depth_deblur_ros.core.threads import threads_here
 import numpy as np
 from pictures import swept, texture
 import pytest
@@ -218,9 +218,9 @@ def test_the_same_frame_gives_the_same_result(small_frame, small_result):
 
 
 def test_threads_change_nothing_but_rounding(small_frame, small_result):
-    before = get_num_threads()
+    before = threads_here()
     alone = deblur(small_frame, SolverParams(threads=1))
-    assert get_num_threads() == before
+    assert threads_here() == before
     np.testing.assert_allclose(alone.motion.vector, small_result.motion.vector, atol=1e-6)
     np.testing.assert_allclose(alone.image, small_result.image, atol=2e-3)
 

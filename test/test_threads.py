@@ -18,7 +18,7 @@ COUNT = 41
 @pytest.fixture
 def use(monkeypatch):
     """Give what says how many threads may be used, even on a machine of one core."""
-    return lambda n: monkeypatch.setattr(threads, 'get_num_threads', lambda: n)
+    return lambda n: monkeypatch.setattr(threads, 'cores', lambda: n)
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_many_may_ask_at_once(use):
 AFTERWARDS = """
 import multiprocessing, time
 from depth_deblur_ros.core import threads
-threads.get_num_threads = lambda: 2
+threads.cores = lambda: 2
 
 def use():
     met = threads.SimpleQueue()

@@ -47,7 +47,7 @@ FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer
 # and solved less far.
 FULL, FAST = Effort(200_000), Effort(80_000)
 PACE = Pace(spacing=0.7, steps=5)
-BRIEF = Effort(32_000, moves=3, readable=24.0, doubt=1.25, pace=PACE)
+BRIEF = Effort(32_000, moves=3, readable=24.0, doubt=1.15, pace=PACE)
 
 
 def deblur(

@@ -122,7 +122,7 @@ def product(
     """
     Multiply left (B, n) by a matrix in blocks; (B, columns of all blocks), unwanted ones zero.
 
-    On numba's threads: a BLAS would keep its own, which wait by spinning.
+    On threads of ours: a BLAS would keep its own, which wait by spinning.
     """
     if wanted is None:
         wanted = np.arange(len(blocks))

@@ -2,7 +2,7 @@
 Work on several threads: a kernel, or a function that lets numpy work.
 
 Kernels run without the interpreter's lock, each thread on a share of the work. numba could do so
-by itself, but compiles what runs side by side four times over, which takes most of a first run.
+by itself, but compiles what runs side by side four times over, which took most of a first run.
 
 To wake a thread takes longer than many a share. So a worker stays awake for a moment after each,
 and what it has not begun when the caller is through, the caller has done itself.
@@ -18,7 +18,7 @@ from threading import local, Thread
 from typing import Any
 
 from depth_deblur_ros.core.crew import Board, dismiss, empty_board, sched_yield
-from numba import config, get_num_threads, njit, set_num_threads
+from numba import config, njit
 from numba.core.compiler import Compiler
 import numpy as np
 
@@ -134,29 +134,30 @@ def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: 
 
 @contextmanager
 def at_most(threads: int) -> Iterator[None]:
-    """Let `on_threads` and numba use so many threads here, and give the thread back as it was."""
-    before, outer = get_num_threads(), getattr(_here, 'limit', None)
-    limit = min(threads, config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    set_num_threads(limit)
-    _here.limit = limit
+    """Let `on_threads` use so many threads here, and give the thread back as it was."""
+    outer = getattr(_here, 'limit', None)
+    _here.limit = min(threads, cores())
     try:
         yield
     finally:
-        set_num_threads(before)
         _here.limit = outer
 
 
+def cores() -> int:
+    """Give how many threads there may be at most: NUMBA_NUM_THREADS, or the cores."""
+    return int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
 def threads_here() -> int:
-    """Give how many threads `on_threads` may use: one within a share, else as many as numba."""
+    """Give how many threads `on_threads` may use: one within a share, else up to the limit."""
     if getattr(_here, 'sharing', False):
         return 1
-    # numba takes longer to say than some kernels to run.
-    return getattr(_here, 'limit', None) or get_num_threads()
+    return getattr(_here, 'limit', None) or cores()
 
 
 def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     """
-    Call kernel(first, end, *data) on pieces of 0..count, on as many threads as numba may use.
+    Call kernel(first, end, *data) on pieces of 0..count, on as many threads as may be.
 
     What the kernel raises is raised when all threads have ended. Any thread may call; what a share
     itself asks for, its own thread does alone.
@@ -179,7 +180,7 @@ def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
 
 def with_crew(lead: Callable[..., None], follow: Callable[..., None], *data: Any) -> None:
     """
-    Call lead(board, *data), and follow(board, *data) on the other threads that numba may use.
+    Call lead(board, *data), and follow(board, *data) on the other threads there may be.
 
     Both are compiled loops that share their work by a board (crew.py); who follows returns when
     the board says that all is over.
