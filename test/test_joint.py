@@ -83,9 +83,14 @@ def test_an_image_that_tells_something_narrows_the_covariance():
     assert sd[0] < 0.35
 
 
+def parts_of(light, length, effort):
+    level, pixels = joint._readable(Level(light, DEPTH, CAMERA), length, effort)
+    return [joint._part(level, k, pixels, effort.pace) for k in range(4)]
+
+
 def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
     monkeypatch.setattr(joint, 'LEAST_SIDE', 40)
-    parts = joint._parts(Level(blurred(TRUTH), DEPTH, CAMERA), 9.0, Effort(80_000, readable=5.0))
+    parts = parts_of(blurred(TRUTH), 9.0, Effort(80_000, readable=5.0))
     assert {part.light.shape for part in parts} == {(40, 56)}
     fx = {part.camera.fx for part in parts}
     assert fx == {CAMERA.fx / 2}
@@ -94,7 +99,7 @@ def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
 def test_parts_lie_where_the_picture_is_busy():
     light = np.full(DEPTH.shape, 0.5, np.float32)
     light[10:40, 60:100] += texture(0, (30, 40)) - 0.5
-    part = joint._parts(Level(light, DEPTH, CAMERA), 5.0, Effort(160 * 224 // 4))[0]
+    part = parts_of(light, 5.0, Effort(160 * 224 // 4))[0]
     assert part.light.std() > 0
     assert np.ptp(part.light) == pytest.approx(np.ptp(light), rel=1e-6)
 
@@ -102,7 +107,7 @@ def test_parts_lie_where_the_picture_is_busy():
 def test_the_camera_of_a_part_sees_what_the_frame_sees():
     """A ray through a part's pixel is the ray through the same pixel of the frame."""
     light = blurred(TRUTH)
-    for part in joint._parts(Level(light, DEPTH, CAMERA), 5.0, Effort(160 * 224 // 4)):
+    for part in parts_of(light, 5.0, Effort(160 * 224 // 4)):
         left, top = CAMERA.cx - part.camera.cx, CAMERA.cy - part.camera.cy
         assert left == round(left) and top == round(top)
         rows, columns = part.light.shape

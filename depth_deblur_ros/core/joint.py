@@ -28,6 +28,7 @@ from depth_deblur_ros.core.start import Start
 from depth_deblur_ros.core.threads import on_threads
 import numpy as np
 
+Of = TypeVar('Of')
 Result = TypeVar('Result')
 
 AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
@@ -84,8 +85,8 @@ def refine(
         return blur_length(p, depth, camera)
 
     p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
-    parts = _parts(Level(light, depth, camera), length(p), effort)
-    begun = _each(lambda part: _begun(part, p), parts)
+    level, pixels = _readable(Level(light, depth, camera), length(p), effort)
+    begun = _each(lambda k: _begun(_part(level, k, pixels, effort.pace), p), range(4))
     pull = Pull(p, certainty, DISSENT[camera.transfer])
     return _moved(begun, pull, length, effort)
 
@@ -125,7 +126,7 @@ def _begun(part: Part, p: Vector) -> tuple[Part, Vector, Vector]:
     return found.part, slope, curvature_of(found, image)
 
 
-def _each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+def _each(work: Callable[[Of], Result], parts: Sequence[Of]) -> list[Result]:
     """Work on the parts side by side: they are too small for two threads to share one."""
     found: dict[int, Result] = {}
 
@@ -163,29 +164,30 @@ def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
     return np.asarray(half * np.clip(values, *BENDS) @ half.T)
 
 
-def _parts(level: Level, length: float, effort: Effort) -> list[Part]:
-    """Choose one part of each quarter, the most textured, at a size where the blur is readable."""
+def _readable(level: Level, length: float, effort: Effort) -> tuple[Level, float]:
+    """Give the level at a size where the blur is readable, and how many px of it to look at."""
     factor, least = 1, min(level.image.shape)
     while length > effort.readable * factor and least >= 4 * LEAST_SIDE * factor:
         factor *= 2
     if factor > 1:
         level = scaled_level(level, level.camera.width // factor, level.camera.height // factor)
+    return level, effort.pixels * min(1.0, AFFORDABLE * factor / length)
+
+
+def _part(level: Level, k: int, pixels: float, pace: Pace) -> Part:
+    """Choose the most textured part of quarter k, for a quarter of so many pixels."""
     light, depth, camera = level.image, level.depth, level.camera
     height, width = (side // 2 for side in light.shape)
-    pixels = effort.pixels * min(1.0, AFFORDABLE * factor / length)
     share = min(1.0, math.sqrt(pixels / light.size))
     rows, columns = int(height * share), int(width * share)
-    parts = []
-    for k in range(4):
-        top, left = k // 2 * height, k % 2 * width
-        quarter = light[top : top + height, left : left + width]
-        y, x = _busiest(stored_from_light(quarter, camera.transfer), rows, columns)
-        box = np.s_[top + y : top + y + rows, left + x : left + x + columns]
-        cut = camera.cropped(left + x, top + y, columns, rows)
-        own = np.ascontiguousarray(light[box])
-        counts = (stored_from_light(own, camera.transfer) < SATURATED).astype(np.float32)
-        parts.append(Part(own, counts, np.ascontiguousarray(depth[box]), cut, k, pace=effort.pace))
-    return parts
+    top, left = k // 2 * height, k % 2 * width
+    quarter = light[top : top + height, left : left + width]
+    y, x = _busiest(stored_from_light(quarter, camera.transfer), rows, columns)
+    box = np.s_[top + y : top + y + rows, left + x : left + x + columns]
+    cut = camera.cropped(left + x, top + y, columns, rows)
+    own = np.ascontiguousarray(light[box])
+    counts = (stored_from_light(own, camera.transfer) < SATURATED).astype(np.float32)
+    return Part(own, counts, np.ascontiguousarray(depth[box]), cut, k, pace=pace)
 
 
 def _busiest(stored: FloatImage, rows: int, columns: int) -> tuple[int, int]:
