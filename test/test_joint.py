@@ -1,6 +1,5 @@
 """The joint refinement: nearer to the truth than its start, and nowhere without a reason."""
 
-import os
 from pathlib import Path
 import subprocess
 import sys
@@ -139,21 +138,18 @@ def test_the_curvature_follows_a_quadratic():
     assert np.linalg.eigvalsh(wild).max() <= joint.BENDS[1] + 1e-9
 
 
-def test_the_parts_are_refined_where_numba_has_no_openmp():
+def test_no_threads_of_numba_are_started():
+    """They would be one more pool, which waits by spinning."""
     code = (
-        'import numba, test_joint as t; found = t.refine(t.blurred(t.TRUTH), t.DEPTH, t.CAMERA, '
-        't.start(0.9 * t.TRUTH), t.EFFORT); print(numba.threading_layer(), t.off(found.vector))'
+        'import numba, test_joint as t; '
+        't.refine(t.blurred(t.TRUTH), t.DEPTH, t.CAMERA, t.start(0.9 * t.TRUTH), t.EFFORT); '
+        'numba.threading_layer()'
     )
-    plainest = {**os.environ, 'NUMBA_THREADING_LAYER': 'workqueue'}
     done = subprocess.run(
         [sys.executable, '-c', code],
         cwd=Path(__file__).parent,
-        env=plainest,
         capture_output=True,
         text=True,
         timeout=120,
     )
-    assert done.returncode == 0, done.stderr
-    layer, error = done.stdout.split()
-    assert layer == 'workqueue'
-    assert float(error) < 0.4 * off(0.9 * TRUTH)
+    assert done.stderr.endswith('ValueError: Threading layer is not initialized.\n')
