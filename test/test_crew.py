@@ -1,7 +1,7 @@
 """A crew: each piece is done once, whoever comes, and nobody takes a piece of other work."""
 
 from depth_deblur_ros.core import threads
-from depth_deblur_ros.core.crew import await_all, await_more, begin, hand_in, take
+from depth_deblur_ros.core.crew import all_done, await_more, begin, hand_in, take
 from depth_deblur_ros.core.threads import with_crew
 from numba import njit
 import numpy as np
@@ -22,36 +22,32 @@ def work(kind, piece, count, rows):
 
 
 @njit
-def follow(board, rows):
-    while await_more(board):
-        kind, piece, count = take(board)
+def loop(board, leads, rows):
+    turn = count = 0
+    while True:
+        kind, piece, of = take(board)
         if kind >= 0:
-            work(kind, piece, count, rows)
-            hand_in(board)
-
-
-@njit
-def lead(board, rows):
-    for k in range(ROUNDS):
-        count = begin(board, k % 2, ROWS)
-        while True:
-            kind, piece, of = take(board)
-            if kind < 0:
-                break
             work(kind, piece, of, rows)
             hand_in(board)
-        await_all(board, count)
+        elif not leads:
+            if not await_more(board):
+                return
+        elif all_done(board, count):
+            if turn == ROUNDS:
+                return
+            count = begin(board, turn % 2, ROWS)
+            turn += 1
 
 
-@njit
-def absent(board, rows):
-    pass
+def alone(board, leads, rows):
+    if leads:
+        loop(board, leads, rows)
 
 
-def worked(helper=follow):
+def worked(how=loop):
     rows = np.zeros((3, ROWS), np.int64)
     rows[0] = np.arange(ROWS)
-    with_crew(lead, helper, rows)
+    with_crew(how, rows)
     return rows
 
 
@@ -64,25 +60,27 @@ def use(monkeypatch):
 @pytest.mark.parametrize('number', [2, 3, 5])
 def test_any_number_of_threads_does_each_piece_once_and_in_order(use, number):
     use(1)
-    alone = worked()
-    assert (alone[2] == ROUNDS).all()
+    by_one = worked()
+    assert (by_one[2] == ROUNDS).all()
     use(number)
     for _ in range(5):
-        np.testing.assert_array_equal(worked(), alone)
+        np.testing.assert_array_equal(worked(), by_one)
 
 
 def test_nobody_waits_for_who_does_not_come(use):
     use(1)
-    alone = worked()
+    by_one = worked()
     use(3)
-    np.testing.assert_array_equal(worked(absent), alone)
+    np.testing.assert_array_equal(worked(alone), by_one)
 
 
 def test_a_loop_that_fails_lets_the_others_go(use):
-    def fail(board, rows):
-        raise ValueError('lost')
+    def fail(board, leads, rows):
+        if leads:
+            raise ValueError('lost')
+        loop(board, leads, rows)
 
     use(3)
     with pytest.raises(ValueError, match='lost'):
-        with_crew(fail, follow, np.zeros((3, ROWS), np.int64))
+        with_crew(fail, np.zeros((3, ROWS), np.int64))
     assert (worked()[2] == ROUNDS).all()

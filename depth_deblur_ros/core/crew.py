@@ -94,10 +94,12 @@ def hand_in(board):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def await_all(board, count):  # type: ignore[no-untyped-def]
-    """Wait until so many pieces are done."""
-    while _look(board, DONE) < count:
-        sched_yield()
+def all_done(board, count):  # type: ignore[no-untyped-def]
+    """Say whether so many pieces are done; if not, let others work."""
+    if _look(board, DONE) >= count:
+        return True
+    sched_yield()
+    return False
 
 
 @njit(cache=True, nogil=True)

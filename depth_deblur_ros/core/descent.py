@@ -10,7 +10,7 @@ P = 1 / ease.
 
 from __future__ import annotations
 
-from depth_deblur_ros.core.crew import await_all, await_more, begin, hand_in, take
+from depth_deblur_ros.core.crew import all_done, await_more, begin, hand_in, take
 from depth_deblur_ros.core.data import FloatImage
 from depth_deblur_ros.core.quadratic import Quadratic, sum_rows
 from depth_deblur_ros.core.scatter import scatter_rows
@@ -19,7 +19,8 @@ from depth_deblur_ros.core.threads import SHARED, with_crew
 from numba import njit
 import numpy as np
 
-GATHER, SCATTER, SUM, ADVANCE = range(4)
+KINDS = 4
+GATHER, SCATTER, SUM, ADVANCE = range(KINDS)
 
 
 def conjugate_gradients(
@@ -32,24 +33,26 @@ def conjugate_gradients(
     """
     sweep, rows = problem.sweep, latent.shape[1]
     d, q = sweep.directions
+    d[:] = 0
     sums = np.zeros((rows, 3), np.float32), np.zeros(rows, np.float32), np.zeros(2, np.float32)
     planes = latent, slope, d, q, problem.links, problem.ease
     blurred = problem.trust, sweep.taken, sweep.strips
-    with_crew(_lead, _follow, limit, planes, blurred, sweep.parts(), sums)
+    with_crew(_descend, limit, planes, blurred, sweep.parts(), sums)
     return latent
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _work(kind, piece, count, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
     """Do one piece of a step's work."""
     latent, r, d, q, links, ease = planes
     trust, taken, strips = blurred
     products, squares, pace = sums
-    rows = (trust.shape[1], len(strips), r.shape[1], r.shape[1])[kind]
+    rows = _rows(kind, planes, blurred)
     first, end = piece * rows // count, (piece + 1) * rows // count
     if kind == GATHER:
         nearness, flow, shares, cells, far, room = parts
-        gather_rows(first, end, d, trust, False, taken, nearness, flow, shares, cells, far, room)
+        less = kind != GATHER
+        gather_rows(first, end, d, trust, less, taken, nearness, flow, shares, cells, far, room)
     elif kind == SCATTER:
         nearness, flow, shares, cells, far, room = parts
         scatter_rows(first, end, taken, strips, nearness, flow, shares, cells, far, room)
@@ -60,48 +63,60 @@ def _work(kind, piece, count, planes, blurred, parts, sums):  # type: ignore[no-
         _advance(first, end, latent, r, d, q, ease, pace[0], pace[1], squares)
 
 
-@njit(cache=True, nogil=True)
-def _all(board, kind, rows, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
-    """Do all of one kind, together."""
-    count = begin(board, kind, rows)
-    while True:
-        mine, piece, of = take(board)
-        if mine < 0:
-            break
-        _work(mine, piece, of, planes, blurred, parts, sums)
-        hand_in(board)
-    await_all(board, count)
+@njit(cache=True, nogil=True, inline='always')
+def _rows(kind, planes, blurred):  # type: ignore[no-untyped-def]
+    """Give of how many rows, or strips, a kind of work is."""
+    if kind == GATHER:
+        return blurred[0].shape[1]
+    return blurred[2].shape[0] if kind == SCATTER else planes[0].shape[1]
 
 
-@njit(cache=True, nogil=True)
-def _follow(board, limit, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
-    while await_more(board):
-        kind, piece, count = take(board)
-        if kind >= 0:
-            _work(kind, piece, count, planes, blurred, parts, sums)
-            hand_in(board)
-
-
-@njit(cache=True, nogil=True)
-def _lead(board, limit, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
-    rows, (products, squares, pace) = len(sums[1]), sums
-    planes[2][:] = 0
-    pace[:] = 0
-    _all(board, ADVANCE, rows, planes, blurred, parts, sums)
-    left = squares.astype(np.float64).sum()
-    for _ in range(limit):
-        if left <= 0:
-            break
-        _all(board, GATHER, blurred[0].shape[1], planes, blurred, parts, sums)
-        _all(board, SCATTER, len(blurred[2]), planes, blurred, parts, sums)
-        _all(board, SUM, rows, planes, blurred, parts, sums)
-        dq, rq, qq = products.astype(np.float64).sum(0)
-        if dq <= 0:  # nothing is trusted and nothing holds together
-            break
+@njit(cache=True, nogil=True, inline='always')
+def _measured(sums, left):  # type: ignore[no-untyped-def]
+    """Set the pace of a step, by what is left; give <d, q>."""
+    products, _, pace = sums
+    dq = rq = qq = 0.0
+    for row in products:
+        dq, rq, qq = dq + row[0], rq + row[1], qq + row[2]
+    if dq > 0:
         step = left / dq
         pace[0], pace[1] = step, max(0.0, left - step * (2 * rq - step * qq)) / left
-        _all(board, ADVANCE, rows, planes, blurred, parts, sums)
-        left = squares.astype(np.float64).sum()
+    return dq
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _total(values):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _descend(board, leads, limit, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
+    """Take pieces; who leads says what is next: the first direction, then step after step."""
+    kind, count, steps, left = np.int64(ADVANCE), 0, 0, 0.0
+    if leads:
+        count = begin(board, kind, _rows(kind, planes, blurred))
+    while True:
+        mine, piece, of = take(board)
+        if mine >= 0:
+            _work(mine, piece, of, planes, blurred, parts, sums)
+            hand_in(board)
+        elif not leads:
+            if not await_more(board):
+                return
+        elif all_done(board, count):
+            if kind == ADVANCE:
+                left = _total(sums[1])
+                if left <= 0 or steps == limit:
+                    return
+                steps += 1
+            # Where d q is not above zero, nothing is trusted and nothing holds together.
+            if kind == SUM and _measured(sums, left) <= 0:
+                return
+            kind = (kind + 1) % KINDS
+            count = begin(board, kind, _rows(kind, planes, blurred))
 
 
 @njit(fastmath=True, **SHARED)

@@ -64,18 +64,25 @@ def _in_cell(latent, p, wide, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _in_cells(latent, p, wide, place):  # type: ignore[no-untyped-def]
-    """Give value and slopes where they read in a few."""
+def _in_cells(latent, p, plane, wide, place):  # type: ignore[no-untyped-def]
+    """Give value and slopes of the three planes where they read in a few."""
     u, v, columns, rows = place
-    value = across = down = splat(np.float32(0))
+    none = splat(np.float32(0))
+    r = g = b = (none, none, none)
     for j in range(rows):
         y = v - splat(np.float32(j))
         for m in range(columns):
-            x, here = u - splat(np.float32(m)), load(latent, p + j * wide + m)
-            value += tent(y) * tent(x) * here
-            across += tent(y) * _rise(x) * here
-            down += _rise(y) * tent(x) * here
-    return value, across, down
+            x, q = u - splat(np.float32(m)), p + j * wide + m
+            w = tent(y) * tent(x), tent(y) * _rise(x), _rise(y) * tent(x)
+            r = _mixed(r, w, load(latent, q))
+            g = _mixed(g, w, load(latent, q + plane))
+            b = _mixed(b, w, load(latent, q + 2 * plane))
+    return r, g, b
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _mixed(seen, weights, here):  # type: ignore[no-untyped-def]
+    return seen[0] + weights[0] * here, seen[1] + weights[1] * here, seen[2] + weights[2] * here
 
 
 @njit(cache=True, nogil=True)
@@ -137,10 +144,10 @@ def _block(y, k, latent, told, sizes, far, places):  # type: ignore[no-untyped-d
             g = _added(g, _in_cell(latent, p + plane, wide, u, v), share, back, w)
             b = _added(b, _in_cell(latent, p + 2 * plane, wide, u, v), share, back, w)
         elif columns * rows <= MANY:
-            place = u, v, columns, rows
-            r = _added(r, _in_cells(latent, p, wide, place), share, back, w)
-            g = _added(g, _in_cells(latent, p + plane, wide, place), share, back, w)
-            b = _added(b, _in_cells(latent, p + 2 * plane, wide, place), share, back, w)
+            seen = _in_cells(latent, p, plane, wide, (u, v, columns, rows))
+            r = _added(r, seen[0], share, back, w)
+            g = _added(g, seen[1], share, back, w)
+            b = _added(b, seen[2], share, back, w)
         else:
             apart(places, u, v, left, top, far)
             r = _added(r, _each(latent, p, wide, places), share, back, w)

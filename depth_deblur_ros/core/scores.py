@@ -166,7 +166,7 @@ def _add_patch(first, end, match, energy, sag, q, step, weight, flow, c, d):  # 
         store(d, k, load(d, k) + w * where_positive(inside, own, one))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _price(q, i, step, costs):  # type: ignore[no-untyped-def]
     """Give what motion i costs before anything is seen."""
     price = costs[0] * (q[i + 4 * step] ** 2 + q[i + 5 * step] ** 2)
@@ -190,7 +190,8 @@ def judge(first, end, q, matches, weights, flows, tables, shares, costs, found):
         for i in range(start, stop):
             found[i] = _price(q, i, step, costs)
         for s in range(len(shares)):
-            c[:], d[:] = 0, EVEN
+            for i in range(CHUNK):
+                c[i], d[i] = 0, EVEN
             told, weight, flow = matches[s], weights[s], flows[s]
             for b in range(len(weight)):
                 patch = told[b], energy, sag, q, step, weight[b], flow[b]

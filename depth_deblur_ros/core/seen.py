@@ -82,7 +82,9 @@ def _see(first, end, nearness, ray, motion, flow, seen):  # type: ignore[no-unty
     height, width = nearness.shape
     samples, one = seen.shape[1], np.uintp(1)
     places, values = np.empty(width, np.int32), np.empty(width, np.float32)
-    across = np.arange(1, width + 1).astype(np.float32)
+    across = np.empty(width, np.float32)
+    for x in range(width):
+        across[x] = x + 1
     # Cell (y, x) of the four pixels from (y - 1, x - 1) on: its nearest surface.
     cells = np.empty((height + 1, width + 1), np.float32)
     view = np.empty((height, width), np.float32)
@@ -98,8 +100,10 @@ def _see(first, end, nearness, ray, motion, flow, seen):  # type: ignore[no-unty
                 own[x] = max(above[x], above[x + one], below[x], below[x + one])
         _fill_uncovered(view, nearness)
         for y in range(height):
-            seen[y, i, :width] = view[y]
-            seen[y, i, width:] = view[y, width - 1]
+            # Not by slices: what would say that they do not fit takes a second to compile.
+            own, out = view[y], seen[y, i]
+            for x in range(np.uintp(0), np.uintp(len(out))):
+                out[x] = own[min(x, np.uintp(width - 1))]
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
-from depth_deblur_ros.core.crew import await_all, await_more, begin, hand_in, take
+from depth_deblur_ros.core.crew import all_done, await_more, begin, hand_in, take
 from depth_deblur_ros.core.data import Vector
 from depth_deblur_ros.core.lanes import whole_blocks, WIDTH
 from depth_deblur_ros.core.scores import common, common_score, judge, Scale
@@ -47,59 +47,54 @@ def shrink_around(
     found = np.empty(whole_blocks(many * count))
     q = np.zeros(size * found.size, np.float32)
     steps = radius * _steps()[:, :count] @ (np.diag(SPREAD) if spread is None else spread)
-    with_crew(
-        _lead,
-        _follow,
-        np.ascontiguousarray(steps[..., :size]),
-        qs,
-        best,
-        (q, *common(scales, size), found),
-    )
+    steps = np.ascontiguousarray(steps[..., :size])
+    with_crew(_shrink, steps, qs, best, (q, *common(scales, size), found))
     return qs
 
 
+@njit(cache=True, nogil=True, inline='always')
+def _try(step, qs, q, most):  # type: ignore[no-untyped-def]
+    """Write the motions to try, a step (count, size) from qs (n, size), by components."""
+    for j in range(len(qs)):
+        for m in range(qs.shape[1]):
+            for k in range(len(step)):
+                q[m * most + j * len(step) + k] = qs[j, m] + step[k, m]
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _choose(step, qs, best, found):  # type: ignore[no-untyped-def]
+    """Go where it is better."""
+    for j in range(len(qs)):
+        lowest = 0
+        for k in range(len(step)):
+            if found[j * len(step) + k] < found[j * len(step) + lowest]:
+                lowest = k
+        if found[j * len(step) + lowest] < best[j]:
+            best[j] = found[j * len(step) + lowest]
+            for m in range(qs.shape[1]):
+                qs[j, m] += step[lowest, m]
+
+
 @njit(cache=True, nogil=True)
-def _judge_piece(piece, count, told):  # type: ignore[no-untyped-def]
+def _shrink(board, leads, steps, qs, best, told):  # type: ignore[no-untyped-def]
+    """Take pieces of what is to be judged; who leads chooses, and says what to try next."""
     q, matches, weights, flows, tables, shares, costs, found = told
-    blocks = found.size // WIDTH
-    first, end = piece * blocks // count, (piece + 1) * blocks // count
-    judge(first, end, q, matches, weights, flows, tables, shares, costs, found)
-
-
-@njit(cache=True, nogil=True)
-def _follow(board, steps, qs, best, told):  # type: ignore[no-untyped-def]
-    while await_more(board):
-        kind, piece, count = take(board)
-        if kind >= 0:
-            _judge_piece(piece, count, told)
-            hand_in(board)
-
-
-@njit(cache=True, nogil=True)
-def _judge_all(board, told):  # type: ignore[no-untyped-def]
-    count = begin(board, 0, told[-1].size // WIDTH)
+    rounds = count = 0
     while True:
-        kind, piece, _ = take(board)
-        if kind < 0:
-            break
-        _judge_piece(piece, count, told)
-        hand_in(board)
-    await_all(board, count)
-
-
-@njit(cache=True, nogil=True)
-def _lead(board, steps, qs, best, told):  # type: ignore[no-untyped-def]
-    q, found = told[0], told[-1]
-    (many, size), count = qs.shape, steps.shape[1]
-    for step in steps:
-        for j in range(many):
-            for m in range(size):
-                for k in range(count):
-                    q[m * found.size + j * count + k] = qs[j, m] + step[k, m]
-        _judge_all(board, told)
-        for j in range(many):
-            own = found[j * count : (j + 1) * count]
-            lowest = np.argmin(own)
-            if own[lowest] < best[j]:
-                best[j] = own[lowest]
-                qs[j] += step[lowest]
+        kind, piece, of = take(board)
+        if kind >= 0:
+            blocks = found.size // WIDTH
+            first, end = piece * blocks // of, (piece + 1) * blocks // of
+            judge(first, end, q, matches, weights, flows, tables, shares, costs, found)
+            hand_in(board)
+        elif not leads:
+            if not await_more(board):
+                return
+        elif all_done(board, count):
+            if rounds > 0:
+                _choose(steps[rounds - 1], qs, best, found)
+            if rounds == len(steps):
+                return
+            _try(steps[rounds], qs, q, found.size)
+            rounds += 1
+            count = begin(board, np.int64(0), found.size // WIDTH)

@@ -178,19 +178,19 @@ def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
         raise error
 
 
-def with_crew(lead: Callable[..., None], follow: Callable[..., None], *data: Any) -> None:
+def with_crew(loop: Callable[..., None], *data: Any) -> None:
     """
-    Call lead(board, *data), and follow(board, *data) on the other threads there may be.
+    Call loop(board, leads, *data) here, where it leads, and on the other threads there may be.
 
-    Both are compiled loops that share their work by a board (crew.py); who follows returns when
-    the board says that all is over.
+    A compiled loop that shares its work by a board (crew.py): the one that leads names what is to
+    be done, the others return when all is over.
     """
     threads = threads_here()
     board: Board = empty_board(threads)
     workers = [_worker() for _ in range(1, threads)]
     for worker in workers:
-        worker.ask(partial(follow, board, *data))
-    outcomes = [_outcome(partial(lead, board, *data))]
+        worker.ask(partial(loop, board, False, *data))
+    outcomes = [_outcome(partial(loop, board, True, *data))]
     dismiss(board)
     outcomes += [worker.outcome() for worker in workers]
     _idle.extend(workers)

@@ -87,16 +87,16 @@ def sharpness(grey: FloatImage) -> tuple[float, float]:
     on_threads(_compare, DIRECTIONS * height, rimmed, step, 1.0, near)
     on_threads(_compare, DIRECTIONS * height, rimmed, step, FURTHER, far)
     ratios = np.empty(DIRECTIONS, np.float32)
-    on_threads(_rate, DIRECTIONS, near, far, ratios)
+    on_threads(_rate, DIRECTIONS, near, far, near.max((1, 2)), ratios)
     return float(ratios.min()), float(ratios.max())
 
 
 @njit(**SHARED)
-def _rate(first, end, near, far, ratios):  # type: ignore[no-untyped-def]
+def _rate(first, end, near, far, most, ratios):  # type: ignore[no-untyped-def]
     """Compare the root mean squares per px of near and far, over the strongest tenth of near."""
     for k in range(first, end):
         steep, wide = near[k].reshape(-1), far[k].reshape(-1)
-        greatest = max(steep.max(), np.float32(1e-9))
+        greatest = max(most[k], np.float32(1e-9))
         counts = np.zeros(BINS + 1, np.int64)
         to_bin = np.float32(BINS) / greatest
         for i in range(steep.size):
