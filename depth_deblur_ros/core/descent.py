@@ -51,7 +51,7 @@ def _work(kind, piece, count, planes, blurred, parts, sums):  # type: ignore[no-
     first, end = piece * rows // count, (piece + 1) * rows // count
     if kind == GATHER:
         nearness, flow, shares, cells, far, room = parts
-        less = kind != GATHER
+        less = kind != GATHER  # for False, a constant, the kernel would be compiled once more
         gather_rows(first, end, d, trust, less, taken, nearness, flow, shares, cells, far, room)
     elif kind == SCATTER:
         nearness, flow, shares, cells, far, room = parts

@@ -87,7 +87,7 @@ def _mixed(seen, weights, here):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _each(latent, p, wide, places):  # type: ignore[no-untyped-def]
-    """Give value and slopes where each pixel reads by itself; places: u, v, scratch, results."""
+    """Give value and slopes where pixels read each by itself; places: u, v, then the results."""
     for k in range(WIDTH):
         u, v = places[k], places[WIDTH + k]
         x, y = np.floor(u), np.floor(v)

@@ -97,4 +97,4 @@ def _shrink(board, leads, steps, qs, best, told):  # type: ignore[no-untyped-def
                 return
             _try(steps[rounds], qs, q, found.size)
             rounds += 1
-            count = begin(board, np.int64(0), found.size // WIDTH)
+            count = begin(board, np.int64(0), found.size // WIDTH)  # all work is of one kind
