@@ -169,13 +169,7 @@ def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     many = min(threads * PIECES, count)
     pieces = iter([(k * count // many, (k + 1) * count // many) for k in range(many)])
     share = partial(_work, kernel, pieces, data)
-    workers = [_worker() for _ in range(1, threads)]
-    for worker in workers:
-        worker.ask(share)
-    outcomes = [_outcome(share), *(worker.outcome() for worker in workers)]
-    _idle.extend(workers)
-    for error in filter(None, outcomes):
-        raise error
+    _together(share, share, threads)
 
 
 def with_crew(loop: Callable[..., None], *data: Any) -> None:
@@ -187,12 +181,22 @@ def with_crew(loop: Callable[..., None], *data: Any) -> None:
     """
     threads = threads_here()
     board: Board = empty_board(threads)
+
+    def lead() -> None:
+        try:
+            loop(board, True, *data)
+        finally:
+            dismiss(board)
+
+    _together(lead, partial(loop, board, False, *data), threads)
+
+
+def _together(own: Callable[[], None], share: Callable[[], None], threads: int) -> None:
+    """Do one's own while the other threads do a share each; raise what any of them raised."""
     workers = [_worker() for _ in range(1, threads)]
     for worker in workers:
-        worker.ask(partial(loop, board, False, *data))
-    outcomes = [_outcome(partial(loop, board, True, *data))]
-    dismiss(board)
-    outcomes += [worker.outcome() for worker in workers]
+        worker.ask(share)
+    outcomes = [_outcome(own), *(worker.outcome() for worker in workers)]
     _idle.extend(workers)
     for error in filter(None, outcomes):
         raise error
