@@ -32,11 +32,14 @@ def texture(rng: np.random.Generator, height: int, width: int) -> FloatImage:
     return np.clip(0.6 * grey + 0.4 * np.stack(channels, -1), 0, 1).astype(np.float32)
 
 
-def blurred_frame(width: int, height: int, blur_px: float) -> tuple[RgbdFrame, Motion]:
+def blurred_frame(
+    width: int, height: int, blur_px: float, transfer: str = 'srgb', noise: float = NOISE
+) -> tuple[RgbdFrame, Motion]:
     """Give a frame of a wall with a box before it, mean blur as asked, and its true motion."""
     rng = np.random.default_rng(0)
     focal = 0.82 * width
-    camera = CameraIntrinsics(focal, focal, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    middle = width / 2 - 0.5, height / 2 - 0.5
+    camera = CameraIntrinsics(focal, focal, *middle, width, height, transfer=transfer)
     y, x = np.mgrid[:height, :width] / np.float32(width)
     depth = (1.5 + 1.5 * x + 0.5 * y).astype(np.float32)
     depth[height // 3 : 2 * height // 3, width // 4 : width // 2] = 1.2
@@ -44,8 +47,8 @@ def blurred_frame(width: int, height: int, blur_px: float) -> tuple[RgbdFrame, M
     motion = Motion.from_vector(p * blur_px / blur_length(p, depth, camera))
     blur = blur_operator(motion, depth, camera)
     sharp = texture(rng, *blur.latent_shape[:2])
-    taken = stored_from_light(blur.apply(light_from_stored(sharp, 'srgb')), 'srgb')
-    taken = taken + NOISE * rng.standard_normal(taken.shape, np.float32)
+    taken = stored_from_light(blur.apply(light_from_stored(sharp, transfer)), transfer)
+    taken = taken + noise * rng.standard_normal(taken.shape, np.float32)
     return RgbdFrame(np.clip(taken, 0, 1), depth, camera), motion
 
 

@@ -44,12 +44,12 @@ MODES = {  # the motion, the image, what for
         'pictures, data sets, SLAM after the fact',
     ),
     'fast': (
-        'found; that of the first frame refined',
+        'found; that of the first frame refined briefly, or as in full if it is clean',
         'fewer rounds: softer where the blur is long',
         'live',
     ),
     'motion': (
-        'found; that of the first frame refined a little',
+        'as in fast',
         'left as it is',
         'odometry: from the second frame on it costs the search alone',
     ),

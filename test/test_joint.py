@@ -50,14 +50,16 @@ def test_a_start_that_is_too_short_or_too_long_comes_nearer(factor, effort, left
     assert off(found.vector) < left * off(factor * TRUTH)
 
 
-@pytest.mark.parametrize('wrong', [{'pixels': 0}, {'moves': 0}, {'readable': 0.0}])
+@pytest.mark.parametrize(
+    'wrong', [{'pixels': 0}, {'moves': 0}, {'readable': 0.0}, {'enough': np.nan}]
+)
 def test_an_effort_that_is_none_is_refused(wrong):
     with pytest.raises(InputError, match='not Effort'):
         Effort(**{'pixels': 80_000, **wrong})
 
 
 def test_a_pace_that_leads_nowhere_is_refused():
-    for wrong in ({'spacing': 0.0}, {'spacing': np.nan}, {'steps': 0}):
+    for wrong in ({'spacing': 0.0}, {'spacing': np.nan}, {'steps': 0}, {'last': 0}):
         with pytest.raises(InputError, match='not Pace'):
             Pace(**wrong)
 
@@ -93,6 +95,14 @@ def test_a_long_blur_is_read_at_half_the_size(monkeypatch):
     assert {part.light.shape for part in parts} == {(40, 56)}
     fx = {part.camera.fx for part in parts}
     assert fx == {CAMERA.fx / 2}
+
+
+def test_at_half_the_size_half_as_many_pixels_are_looked_at(monkeypatch):
+    monkeypatch.setattr(joint, 'LEAST_SIDE', 40)
+    monkeypatch.setattr(joint, 'MOST', 14_000)
+    for readable, most in ((50.0, 14_000), (5.0, 7_000)):
+        parts = parts_of(blurred(TRUTH), 9.0, Effort(80_000, readable=readable))
+        assert sum(part.light.size for part in parts) == pytest.approx(most, rel=0.05)
 
 
 def test_parts_lie_where_the_picture_is_busy():

@@ -3,7 +3,14 @@
 from depth_deblur_ros.core import likelihood
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
-from depth_deblur_ros.core.likelihood import curvature_of, Part, posterior, settled, slope_of
+from depth_deblur_ros.core.likelihood import (
+    curvature_of,
+    Pace,
+    Part,
+    posterior,
+    settled,
+    slope_of,
+)
 import numpy as np
 import oracle
 from pictures import texture
@@ -13,7 +20,7 @@ TINY = CameraIntrinsics(40.0, 40.0, 15.5, 15.5, 32, 32, transfer='linear')
 TRUTH = np.array([0.0, 0.1, 0.03, 0.02, 0.0, 0.0])
 
 
-def part(camera, motion, seed=0, sigma=0.01, scene=0):
+def part(camera, motion, seed=0, sigma=0.01, scene=0, pace=None):
     """Give a part of a picture that a motion blurs, with noise, before a slanted wall."""
     shape = camera.height, camera.width
     depth = np.float32(2 + 0.5 * np.indices(shape)[1] / shape[1])
@@ -22,7 +29,7 @@ def part(camera, motion, seed=0, sigma=0.01, scene=0):
     latent = np.repeat(texture(scene, (high, wide))[..., None], 3, 2).astype(np.float32)
     noise = sigma * np.random.default_rng(5).standard_normal(shape)
     light = np.float32(blur.apply(latent)[..., 0] + noise)
-    return Part(light, np.ones(shape, np.float32), depth, camera, seed)
+    return Part(light, np.ones(shape, np.float32), depth, camera, seed, pace=pace or Pace())
 
 
 def dense(found):
@@ -56,9 +63,9 @@ def minus_log_likelihood(p, one):
 
 @pytest.fixture
 def converged(monkeypatch):
-    """Hold the links at the blurred picture, which no motion changes, and solve to the end."""
+    """Hold the links at the blurred picture, which no motion changes; give a pace to the end."""
     monkeypatch.setattr(likelihood, 'REWEIGHTINGS', 1)
-    monkeypatch.setattr(likelihood, 'LAST_STEPS', 250)
+    return Pace(last=250)
 
 
 @pytest.mark.slow
@@ -71,9 +78,10 @@ def test_the_slope_is_that_of_the_marginal_likelihood(axis, converged):
     """
     p, step, along = np.pad(0.9 * TRUTH, (0, 3)), 2e-4, np.eye(9)[axis]
     p[7] = 0.02
-    one = part(TINY, TRUTH)
+    one = part(TINY, TRUTH, pace=converged)
     ahead, behind = (minus_log_likelihood(p + s * step * along, one) for s in (1, -1))
-    told = [slope_of(posterior(part(TINY, TRUTH, seed), p))[0] @ along for seed in range(0, 40)]
+    parts = [part(TINY, TRUTH, seed, pace=converged) for seed in range(40)]
+    told = [slope_of(posterior(one, p))[0] @ along for one in parts]
     expected = (ahead - behind) / (2 * step)
     error = 3 * np.std(told) / np.sqrt(len(told)) + 0.05 * abs(expected)
     assert abs(np.mean(told) - expected) < error

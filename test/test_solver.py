@@ -255,6 +255,18 @@ def test_where_neighbours_tell_what_to_expect_fast_finds_what_motion_finds(small
         assert not np.array_equal(cold.vector, fast.motion.vector)
 
 
+@pytest.mark.parametrize(('noise', 'alike'), [(0.0, True), (0.01, False)])
+def test_a_clean_picture_is_asked_in_full_in_every_mode(noise, alike):
+    """Where nothing hides what it knows, the first frame's motion is that of mode full."""
+    image = swept(texture(1, (160, 224)), 10, 0.4, noise)
+    depth, camera = np.full(image.shape, 2, np.float32), replace(SMALL, transfer='linear')
+    frame = RgbdFrame(image, depth, camera)
+    full, *others = (deblur(frame, SolverParams(mode=mode)) for mode in ('full', 'fast', 'motion'))
+    assert full.outcome is Outcome.SOLVED
+    for other in others:
+        assert np.array_equal(full.motion.vector, other.motion.vector) == alike
+
+
 def test_fast_improves_the_image(small_frame):
     result = deblur(small_frame, SolverParams(mode='fast'))
     truth = texture(1, (160, 224))

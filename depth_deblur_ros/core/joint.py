@@ -32,10 +32,11 @@ Of = TypeVar('Of')
 Result = TypeVar('Result')
 
 AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
+MOST = 200_000  # px that are looked at; at half the size half as many, which show twice as much
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 LONGEST_MOVE = 1.0  # px
-ENOUGH, NEGLIGIBLE = 0.15, 0.0075  # px, share of the blur; the first shorter move is the last
+NEGLIGIBLE = 0.0075  # share of the blur; the first shorter move is the last
 # What the likelihood is divided by: at least; per chi^2 of the parts. A camera that stores values
 # by a curve follows sRGB's only about, and the parts share what that gets wrong.
 SOFTEST = 10.0
@@ -50,13 +51,15 @@ class Effort:
 
     pixels: int
     moves: int = 4
+    enough: float = 0.15  # px; the first shorter move is the last
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
     doubt: float = 1.0  # times as large is the covariance as that of a refinement to the end
     pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
-        if self.pixels < 1 or self.moves < 1 or not (self.readable > 0 and self.doubt > 0):
-            raise InputError(f'pixels, moves must be >= 1, readable and doubt > 0, not {self}')
+        more = all(value > 0 for value in (self.enough, self.readable, self.doubt))
+        if self.pixels < 1 or self.moves < 1 or not more:
+            raise InputError(f'pixels, moves must be >= 1, the rest > 0, not {self}')
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +104,7 @@ def _moved(
     parts, slopes, curvatures = zip(*begun, strict=True)
     bends, gs, p = np.array(curvatures), np.array(slopes), pull.start
     bend = FLATTER * bends.sum(0)
-    enough = max(ENOUGH, NEGLIGIBLE * length(p))
+    enough = max(effort.enough, NEGLIGIBLE * length(p))
     for k in range(effort.moves):
         soft = _softening(gs, bends, pull.dissent)
         force = gs.sum(0) / soft + pull.certainty @ (p - pull.start)
@@ -171,7 +174,8 @@ def _readable(level: Level, length: float, effort: Effort) -> tuple[Level, float
         factor *= 2
     if factor > 1:
         level = scaled_level(level, level.camera.width // factor, level.camera.height // factor)
-    return level, effort.pixels * min(1.0, AFFORDABLE * factor / length)
+    pixels = effort.pixels * min(1.0, AFFORDABLE * factor / length)
+    return level, min(pixels, MOST / factor)
 
 
 def _part(level: Level, k: int, pixels: float, pace: Pace) -> Part:

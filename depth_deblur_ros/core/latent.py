@@ -92,6 +92,11 @@ def picture_sigma(stored: FloatImage) -> float:
     return math.hypot(noise_sigma(stored), block_sigma(stored))
 
 
+def is_clean(stored: FloatImage, transfer: str) -> bool:
+    """Tell whether no noise, JPEG or curve of a camera hides what a blurred image knows."""
+    return SIGMA_FLOOR[transfer] <= CLEAN and picture_sigma(stored) <= CLEAN
+
+
 def restore_coarse_to_fine(
     blurred: FloatImage,
     depth: FloatImage,

@@ -35,15 +35,12 @@ from depth_deblur_ros.core.threads import on_threads
 import numpy as np
 
 REWEIGHTINGS = 4  # of the image step
-# Conjugate gradient steps in the last of them: what so few steps leave undone changes its sign
-# from one to the next, and the motion with it.
-LAST_STEPS = 15
 PRIORS = (0.2, 60.0)  # where its weight stays
 DOUBTED = 3.0  # sigma; what is missed by as much counts half
 LEAST_COUNT = 1e-4
-# Least sigma: 8 bit rounding for averaged values; a real camera hides its noise, and more is
-# unexplained there.
-SIGMA_LEAST, SIGMA_MOST = {'linear': 5e-4, 'srgb': 0.012}, 0.1
+# Least sigma: for averaged values, as much as so few steps resolve; a real camera hides its noise,
+# and more is unexplained there.
+SIGMA_LEAST, SIGMA_MOST = {'linear': 0.002, 'srgb': 0.012}, 0.1
 AROUND = 64  # px of noise beyond a part of the frame, so that its margin may change
 
 
@@ -60,11 +57,14 @@ class Pace:
     """How finely the image step works: px from instant to instant, steps of a reweighting."""
 
     spacing: float = 1.0  # of the longest blur
-    steps: int = 10  # conjugate gradients; the last reweighting has LAST_STEPS
+    steps: int = 10  # conjugate gradients in each reweighting but the last
+    # What so few steps leave undone changes its sign from one reweighting to the next, and the
+    # motion with it.
+    last: int = 15
 
     def __post_init__(self) -> None:
-        if not self.spacing > 0 or self.steps < 1:
-            raise InputError(f'spacing must be > 0 and steps >= 1, not {self}')
+        if not self.spacing > 0 or min(self.steps, self.last) < 1:
+            raise InputError(f'spacing must be > 0, steps and last >= 1, not {self}')
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
         problem = reweighted(stored, sweep, transfer, trust, weight)
         push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
         push[1:] += sigma * _prior_noise(problem, part.seed)
-        latent = conjugate_gradients(problem, latent, push, pace.steps if k else LAST_STEPS)
+        latent = conjugate_gradients(problem, latent, push, pace.steps if k else pace.last)
         if follow and k:
             missing = sweep.missing(data, latent)
             missing[1:] -= data[1:]

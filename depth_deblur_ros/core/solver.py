@@ -30,7 +30,7 @@ from depth_deblur_ros.core.data import (
 from depth_deblur_ros.core.depth import fill_depth
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.joint import Effort, refine
-from depth_deblur_ros.core.latent import LatentSteps, restore_coarse_to_fine
+from depth_deblur_ros.core.latent import is_clean, LatentSteps, restore_coarse_to_fine
 from depth_deblur_ros.core.lens import undistorted
 from depth_deblur_ros.core.light import as_colour, light_from_stored, stored_from_light
 from depth_deblur_ros.core.likelihood import Pace
@@ -43,11 +43,11 @@ import numpy as np
 SATURATED, EVENLY = 0.98, 0.02  # stored values; how many more pixels a channel may have there
 SPARSE = 4  # every so many-th pixel tells that
 FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
-# Of the joint refinement. What few pixels tell is blurred by noise, so they are read more finely,
-# and solved less far.
-FULL, FAST = Effort(200_000), Effort(80_000)
-PACE = Pace(spacing=0.7, steps=5)
-BRIEF = Effort(32_000, moves=3, readable=24.0, doubt=1.15, pace=PACE)
+# Of the joint refinement. A clean picture tells more the longer it is asked; another gives nearly
+# all that it knows at the first look, and of long blurs at half the size.
+CLEAN, NOISY = Effort(200_000), Effort(200_000, readable=24.0)
+PACE = Pace(spacing=0.85, steps=7, last=9)
+BRIEF = Effort(52_000, moves=2, enough=0.4, readable=24.0, doubt=1.15, pace=PACE)
 
 
 def deblur(
@@ -72,18 +72,18 @@ def deblur(
         grey = _grey(frame.image, _channels(frame.image))
         found = blind_start(grey, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
-            effort = _effort(params.mode, known=start is not None)
+            effort = _effort(frame, params.mode, known=start is not None)
             found = replace(found, motion=_settled(frame, depth, found, effort), scales=())
         return _finish(frame, depth, found, params, began)
 
 
-def _effort(mode: str, *, known: bool) -> Effort | None:
+def _effort(frame: RgbdFrame, mode: str, *, known: bool) -> Effort | None:
     """Say what the joint refinement may cost, if there is one; known: what about to expect."""
-    if mode == 'full':
-        return FULL
-    if known:
+    if mode != 'full' and known:
         return None
-    return FAST if mode == 'fast' else BRIEF
+    if is_clean(frame.image, frame.camera.transfer):
+        return CLEAN
+    return NOISY if mode == 'full' else BRIEF
 
 
 def _settled(frame: RgbdFrame, depth: FloatImage, found: Start, effort: Effort | None) -> Motion:
