@@ -30,7 +30,9 @@ from depth_deblur_ros.core.quadratic import reweighted
 from depth_deblur_ros.core.sweep import Sweep
 import numpy as np
 
-SHOWN = 3.0  # px of mean blur for which half of a size is worth it; of the full one it always is
+# px of mean blur for which half of a size is worth it (of the full one it always is), and what
+# noise adds to them in brief
+SHOWN, SHOWN_LATER = 3.0, 6.0
 SATURATED = 0.99  # stored values above may stand for any amount of light
 # px of the longest blur, and of a block's own, from one instant of the exposure to the next, and
 # what noise adds to them in brief
@@ -117,7 +119,7 @@ def restore_coarse_to_fine(
     steps = replace(steps, inner=math.ceil(worth * steps.inner), early=1 - EARLIER * haste)
     spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     length = blur_length(motion.by_rows, depth, camera)
-    sizes = 1 + math.floor(math.log2(max(length / SHOWN, 1)))
+    sizes = 1 + math.floor(math.log2(max(length / (SHOWN + SHOWN_LATER * haste), 1)))
     effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste, sizes)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
