@@ -32,7 +32,7 @@ Of = TypeVar('Of')
 Result = TypeVar('Result')
 
 AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
-MOST = 200_000  # px that are looked at; at half the size half as many, which show twice as much
+MOST = 200_000  # px that are looked at; at half the size half of them, which show twice as much
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
 LONGEST_MOVE = 1.0  # px
@@ -49,7 +49,7 @@ BENDS = (0.3, 1.2)  # least and most that moves may correct the curvature by
 class Effort:
     """What a refinement may cost: px that are looked at, moves, the pace of each look."""
 
-    pixels: int
+    pixels: int = MOST  # and no more
     moves: int = 4
     enough: float = 0.15  # px; the first shorter move is the last
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less

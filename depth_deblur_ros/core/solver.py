@@ -45,9 +45,9 @@ SPARSE = 4  # every so many-th pixel tells that
 FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer each
 # Of the joint refinement. A clean picture tells more the longer it is asked; another gives nearly
 # all that it knows at the first look, and of long blurs at half the size.
-CLEAN, NOISY = Effort(200_000), Effort(200_000, readable=24.0)
+CLEAN, NOISY = Effort(), Effort(readable=24.0)
 PACE = Pace(spacing=0.85, steps=7, last=9)
-BRIEF = Effort(52_000, moves=2, enough=0.4, readable=24.0, doubt=1.15, pace=PACE)
+BRIEF = replace(NOISY, pixels=52_000, moves=2, enough=0.4, doubt=1.15, pace=PACE)
 
 
 def deblur(
