@@ -33,8 +33,7 @@ def conjugate_gradients(
     """
     sweep, rows = problem.sweep, latent.shape[1]
     d, q = sweep.directions
-    d[:] = 0
-    sums = np.zeros((rows, 3), np.float32), np.zeros(rows, np.float32), np.zeros(2, np.float32)
+    sums = np.zeros((rows, 2), np.float32), np.zeros(rows, np.float32), np.zeros(2, np.float32)
     planes = latent, slope, d, q, problem.links, problem.ease
     blurred = problem.trust, sweep.taken, sweep.strips
     with_crew(_descend, limit, planes, blurred, sweep.parts(), sums)
@@ -58,7 +57,7 @@ def _work(kind, piece, count, planes, blurred, parts, sums):  # type: ignore[no-
         scatter_rows(first, end, taken, strips, nearness, flow, shares, cells, far, room)
     elif kind == SUM:
         one = np.float32(1)
-        sum_rows(first, end, strips, trust.shape[1], d, r, links, ease, one, q, products)
+        sum_rows(first, end, strips, trust.shape[1], d, links, ease, one, q, products)
     else:
         _advance(first, end, latent, r, d, q, ease, pace[0], pace[1], squares)
 
@@ -75,12 +74,12 @@ def _rows(kind, planes, blurred):  # type: ignore[no-untyped-def]
 def _measured(sums, left):  # type: ignore[no-untyped-def]
     """Set the pace of a step, by what is left; give <d, q>."""
     products, _, pace = sums
-    dq = rq = qq = 0.0
+    dq = qq = 0.0
     for row in products:
-        dq, rq, qq = dq + row[0], rq + row[1], qq + row[2]
+        dq, qq = dq + row[0], qq + row[1]
     if dq > 0:
         step = left / dq
-        pace[0], pace[1] = step, max(0.0, left - step * (2 * rq - step * qq)) / left
+        pace[0], pace[1] = step, max(0.0, step * step * qq / left - 1)
     return dq
 
 

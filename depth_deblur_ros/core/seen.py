@@ -102,8 +102,10 @@ def _see(first, end, nearness, ray, motion, flow, seen):  # type: ignore[no-unty
         for y in range(height):
             # Not by slices: what would say that they do not fit takes a second to compile.
             own, out = view[y], seen[y, i]
-            for x in range(np.uintp(0), np.uintp(len(out))):
-                out[x] = own[min(x, np.uintp(width - 1))]
+            for x in range(np.uintp(0), np.uintp(width)):
+                out[x] = own[x]
+            for x in range(np.uintp(width), np.uintp(len(out))):
+                out[x] = own[width - 1]
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -139,17 +141,19 @@ def _fill_uncovered(view, nearness):  # type: ignore[no-untyped-def]
     """Give uncovered pixels (0) the farther of their row's next surfaces, if there are any."""
     height, width = view.shape
     for y in range(height):
-        x = 0
-        while x < width:
-            if view[y, x] > 0:
+        own, x, left = view[y], 0, 0
+        for k in range(np.uintp(0), np.uintp(width)):
+            left += own[k] == 0
+        while left:
+            if own[x] > 0:
                 x += 1
                 continue
             end = x
-            while end < width and view[y, end] == 0:
+            while end < width and own[end] == 0:
                 end += 1
-            left = view[y, x - 1] if x > 0 else np.float32(np.inf)
-            right = view[y, end] if end < width else np.float32(np.inf)
-            far = min(left, right)
+            before = own[x - 1] if x > 0 else np.float32(np.inf)
+            beyond = own[end] if end < width else np.float32(np.inf)
+            far = min(before, beyond)
             for k in range(x, end):
-                view[y, k] = far if far < np.inf else nearness[y, k]
-            x = end
+                own[k] = far if far < np.inf else nearness[y, k]
+            left, x = left - (end - x), end

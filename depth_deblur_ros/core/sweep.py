@@ -31,7 +31,7 @@ from depth_deblur_ros.core.instants import (
     Layout,
     MANY,
 )
-from depth_deblur_ros.core.lanes import load, splat, store, tent, whole_blocks, WIDTH
+from depth_deblur_ros.core.lanes import load, next_lane, splat, store, tent, whole_blocks, WIDTH
 from depth_deblur_ros.core.scatter import scatter_rows
 from depth_deblur_ros.core.threads import on_threads, SHARED, threads_here
 from numba import njit
@@ -145,10 +145,16 @@ def sweep_of(seen: FloatImage, flow: FloatImage, margin: int, spacing: float = 0
 
 
 @njit(cache=True, nogil=True, inline='always')
+def _row(plane, p):  # type: ignore[no-untyped-def]
+    """Give a block and the one that begins at the next element, which is read; one is enough."""
+    beyond = load(plane, p + 1)
+    return next_lane(beyond, splat(plane[p])), beyond
+
+
+@njit(cache=True, nogil=True, inline='always')
 def _read(plane, p, wide, w):  # type: ignore[no-untyped-def]
-    q = p + wide
-    above = w[0] * load(plane, p) + w[1] * load(plane, p + 1)
-    return above + w[2] * load(plane, q) + w[3] * load(plane, q + 1)
+    (a, b), (c, d) = _row(plane, p), _row(plane, p + wide)
+    return w[0] * a + w[1] * b + w[2] * c + w[3] * d
 
 
 @njit(cache=True, nogil=True)
