@@ -124,10 +124,11 @@ def _advance(first, end, latent, r, d, q, ease, step, turn, products):  # type: 
     for y in range(first, end):
         s = np.float32(0)
         for c in range(3):
+            own = min(c, len(ease) - 1)
             for x in range(width):
                 latent[c, y, x] += step * d[c, y, x]
                 left = r[c, y, x] - step * q[c, y, x]
-                z = left / ease[c, y, x]
+                z = left / ease[own, y, x]
                 r[c, y, x], d[c, y, x] = left, z + turn * d[c, y, x]
                 s += left * z
         products[y] = s

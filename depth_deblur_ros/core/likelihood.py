@@ -120,7 +120,7 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
     data, trust = _observed(part, sweep)
     for k in reversed(range(REWEIGHTINGS)):
         sigma = part.scales.sigma
-        stored = np.repeat(stored_from_light(latent[:1], transfer), 3, 0)
+        stored = stored_from_light(latent[:1], transfer)
         weight = np.float32(part.scales.prior * sigma**2)
         problem = reweighted(stored, sweep, transfer, trust, weight)
         push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
@@ -141,8 +141,7 @@ def _observed(part: Part, sweep: Sweep) -> tuple[FloatImage, FloatImage]:
     noise = _data_noise(part.seed, height, width)[:, :, :width]
     spread = part.scales.sigma * part.slope / np.sqrt(np.maximum(part.counts, LEAST_COUNT))
     data = np.stack([part.light, *(spread * noise)], 2).astype(np.float32)
-    trust = np.repeat(part.trust[..., None], 3, 2)
-    return sweep.blurred_planes(data), sweep.blurred_planes(trust)
+    return sweep.blurred_planes(data), sweep.blurred_planes(part.trust[..., None])
 
 
 def _followed(part: Part, problem: Quadratic, latent: FloatImage, missing: FloatImage) -> Part:
@@ -200,7 +199,7 @@ def _noise(seed: int, height: int, width: int) -> FloatImage:
 def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
     """Give g (9,), (16), and J mu (6, H, W'), where rows see no other turn."""
     blur, weight = found.blur, np.array([1, 0.5, 0.5], np.float32)[:, None, None]
-    light = np.zeros_like(found.problem.trust)
+    light = np.zeros(blur.sweep.blurred_shape, np.float32)
     light[0, :, : found.part.light.shape[1]] = found.part.light
     slope, force = lean(blur, found.latent, light, weight * found.problem.trust)
     force, yn = force.astype(np.float64), blur.ray[-len(force) :].astype(np.float64)

@@ -37,13 +37,14 @@ class Quadratic:
     """
     (7) with the weights of one reweighting: 1/2 |A L - B|^2_trust + 1/2 <L, links L>.
 
-    In planes, as sweep.py lays them out: blurred (3, H, W'), latent (3, h, w).
+    In planes, as sweep.py lays them out: blurred (3, H, W'), latent (3, h, w). What is the same
+    for all three is one plane.
     """
 
     sweep: Sweep
-    trust: FloatImage  # (3, H, W')
+    trust: FloatImage  # (1 or 3, H, W')
     links: FloatImage  # (4, h, w) weights to the neighbours right, below, below right, below left
-    ease: FloatImage  # (3, h, w) 1 / l'^2
+    ease: FloatImage  # (1 or 3, h, w) 1 / l'^2
 
     def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
         """Give minus the gradient at a latent image; missing = B - A latent."""
@@ -57,7 +58,7 @@ class Quadratic:
 def reweighted(
     stored: FloatImage, sweep: Sweep, transfer: str, trust: FloatImage, weight: np.float32
 ) -> Quadratic:
-    """Put the weights of (7) at the present image, stored values in latent planes (3, h, w)."""
+    """Put the weights of (7) at the present image, stored values in planes (1 or 3, h, w)."""
     links = np.zeros((4, *stored.shape[1:]), np.float32)
     on_threads(_link_weights, stored.shape[1], stored, weight, links)
     return Quadratic(sweep, trust, links, light_ease(stored, transfer))
@@ -74,9 +75,9 @@ def _weight(x):  # type: ignore[no-untyped-def]
 @njit(fastmath=True, **SHARED)
 def _link_weights(first, end, stored, weight, links):  # type: ignore[no-untyped-def]
     """Weigh the links to the neighbours right, below, below right, below left: [IRLS]."""
-    _, height, width = stored.shape
+    planes, height, width = stored.shape
     flat, mean = stored.reshape(-1), np.empty(width, np.float32)
-    third, floor = np.float32(1 / 3), np.float32(EPSILON * EPSILON)
+    share, floor = np.float32(1 / planes), np.float32(EPSILON * EPSILON)
     for y in range(max(first, GUARD), min(end, height - GUARD)):
         for k in range(4):
             down, aside = min(k, 1), (1, 0, 1, -1)[k]
@@ -84,22 +85,23 @@ def _link_weights(first, end, stored, weight, links):  # type: ignore[no-untyped
             if down and y == height - GUARD - 1:
                 continue
             mean[:] = floor
-            for c in range(3):
+            for c in range(planes):
                 here = np.uintp((c * height + y) * width)
                 there = np.uintp((c * height + y + down) * width + aside)
                 for x in range(left, right):
                     d = flat[there + x] - flat[here + x]
-                    mean[x] += third * d * d
+                    mean[x] += share * d * d
             # Diagonal links are longer: half the weight.
-            share, row = weight if k < 2 else weight / 2, links[k, y]
+            pull, row = weight if k < 2 else weight / 2, links[k, y]
             for x in range(left, right):
-                row[x] = share * _weight(mean[x])
+                row[x] = pull * _weight(mean[x])
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _pull(links, at, u, ease, p, n):  # type: ignore[no-untyped-def]
-    """Give how one link draws the values at p away from those at n."""
-    return load(links, at) * (load(u, p) - load(u, n)) * smaller(load(ease, p), load(ease, n))
+def _pull(links, at, u, p, n, ease, off):  # type: ignore[no-untyped-def]
+    """Give how one link draws the values at p away from those at n; theirs of ease: off before."""
+    least = smaller(load(ease, p - off), load(ease, n - off))
+    return load(links, at) * (load(u, p) - load(u, n)) * least
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -107,19 +109,20 @@ def _pulls(c, place, u, links, ease, beside, below):  # type: ignore[no-untyped-
     """
     Give how all links draw a block of channel c, and those that also draw the block beside it.
 
-    place: row, column, rows and columns of latent planes.
+    place: row, column, rows and columns of latent planes; by how much less a plane of ease is
+    farther on than one of u.
     """
-    y, x, high, wide = place
-    plane, here = high * wide, y * wide + x
+    y, x, high, wide, less = place
+    plane, here, off = high * wide, y * wide + x, c * less
     p, kept = c * plane + here, c * wide + x
     n = p + wide
     # A row later these are needed at once: asked for now, they take a quarter of the time.
     prefetch(u, n + wide)
-    prefetch(ease, n + wide)
-    right = _pull(links, here, u, ease, p, p + 1)
-    down = _pull(links, plane + here, u, ease, p, n)
-    aslant = _pull(links, 2 * plane + here, u, ease, p, n + 1)
-    back = _pull(links, 3 * plane + here + 1, u, ease, p + 1, n)
+    prefetch(ease, n + wide - off)
+    right = _pull(links, here, u, p, p + 1, ease, off)
+    down = _pull(links, plane + here, u, p, n, ease, off)
+    aslant = _pull(links, 2 * plane + here, u, p, n + 1, ease, off)
+    back = _pull(links, 3 * plane + here + 1, u, p + 1, n, ease, off)
     across, before, behind = beside
     own = right + down + aslant - next_lane(right, across) + next_lane(back, behind)
     drawn = load(below, kept) + own
@@ -128,11 +131,11 @@ def _pulls(c, place, u, links, ease, beside, below):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _added(p, drawn, x, ease, out, sums):  # type: ignore[no-untyped-def]
-    """Add to a block of out; add what it then is to the sums."""
+def _added(p, drawn, x, ease, off, out, sums):  # type: ignore[no-untyped-def]
+    """Add to a block of out, and what it then is to the sums."""
     q = load(out, p) + drawn
     store(out, p, q)
-    return sums[0] + load(x, p) * q, sums[1] + q * q / load(ease, p)
+    return sums[0] + load(x, p) * q, sums[1] + q * q / load(ease, p - off)
 
 
 @njit(cache=True, nogil=True)
@@ -147,17 +150,18 @@ def _add_prior(y, counts, x, links, ease, sign, out, products, below):  # type: 
     flat, plane, none = out.reshape(-1), high * wide, splat(np.float32(0))
     r = g = b = none, none, none
     sums, signs = (none, none), splat(sign)
+    less = plane if ease.size == plane else 0
     for k in range(wide // WIDTH):
-        place, here = (y, k * WIDTH, high, wide), y * wide + k * WIDTH
+        place, here = (y, k * WIDTH, high, wide, less), y * wide + k * WIDTH
         for m in range(4):
             prefetch(links, m * plane + here + wide)
         of_r, r = _pulls(0, place, x, links, ease, r, below)
         of_g, g = _pulls(1, place, x, links, ease, g, below)
         of_b, b = _pulls(2, place, x, links, ease, b, below)
         if counts:
-            sums = _added(here, signs * of_r, x, ease, flat, sums)
-            sums = _added(here + plane, signs * of_g, x, ease, flat, sums)
-            sums = _added(here + 2 * plane, signs * of_b, x, ease, flat, sums)
+            sums = _added(here, signs * of_r, x, ease, 0, flat, sums)
+            sums = _added(here + plane, signs * of_g, x, ease, less, flat, sums)
+            sums = _added(here + 2 * plane, signs * of_b, x, ease, 2 * less, flat, sums)
     if counts:
         room = np.empty(WIDTH, np.float32)
         products[y, 0], products[y, 1] = total(sums[0], room), total(sums[1], room)

@@ -62,8 +62,8 @@ class Sweep:
         return 3, height + 2 * self.room, whole_blocks(width + 2 * self.room)
 
     def blurred_planes(self, image: FloatImage) -> FloatImage:
-        """Lay out a blurred image (H, W, 3) as planes, zero beyond it."""
-        planes = np.zeros(self.blurred_shape, np.float32)
+        """Lay out a blurred image (H, W, 1 or 3) as planes, zero beyond it."""
+        planes = np.zeros((image.shape[2], *self.blurred_shape[1:]), np.float32)
         planes[:, :, : image.shape[1]] = np.moveaxis(image, 2, 0)
         return planes
 
@@ -76,7 +76,7 @@ class Sweep:
     def gather(
         self, latent: FloatImage, weight: FloatImage, out: FloatImage | None = None
     ) -> FloatImage:
-        """Give weight (3, H, W') times A L of latent planes, in `out` if given."""
+        """Give weight (1 or 3, H, W') times A L of latent planes, in `out` if given."""
         return self._gathered(latent, weight, out, less=False)
 
     def missing(
@@ -88,7 +88,7 @@ class Sweep:
     def _gathered(
         self, latent: FloatImage, own: FloatImage, out: FloatImage | None, *, less: bool
     ) -> FloatImage:
-        blurred = np.empty_like(own) if out is None else out
+        blurred = np.empty(self.blurred_shape, np.float32) if out is None else out
         rows = self.blurred_shape[1]
         on_threads(gather_rows, rows, latent, own, less, blurred, *self.parts())
         return blurred
@@ -172,8 +172,8 @@ def _read_each(plane, p, wide, places):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _finish(own, less, blurred, at, found):  # type: ignore[no-untyped-def]
-    store(blurred, at, load(own, at) - found if less else load(own, at) * found)
+def _finish(own, near, less, blurred, at, found):  # type: ignore[no-untyped-def]
+    store(blurred, at, load(own, near) - found if less else load(own, near) * found)
 
 
 @njit(cache=True, nogil=True)
@@ -181,6 +181,7 @@ def _gather_row(y, latent, own, less, blurred, data, far, room, sizes):  # type:
     """Write one row of own times A L, or less A L; all are flat, data the arrays of a Sweep."""
     height, samples, width, high, wide = sizes
     plane, colour = high * wide, height * width
+    further = 0 if own.size == colour else colour  # one plane of own may serve all
     places = np.empty(3 * WIDTH, np.float32)
     for k in range(width // WIDTH):
         r = g = b = splat(np.float32(0))
@@ -210,9 +211,9 @@ def _gather_row(y, latent, own, less, blurred, data, far, room, sizes):  # type:
                 g += _read_each(latent, p + plane, wide, places)
                 b += _read_each(latent, p + 2 * plane, wide, places)
         at, share = y * width + k * WIDTH, splat(one)
-        _finish(own, less, blurred, at, share * r)
-        _finish(own, less, blurred, at + colour, share * g)
-        _finish(own, less, blurred, at + 2 * colour, share * b)
+        _finish(own, at, less, blurred, at, share * r)
+        _finish(own, at + further, less, blurred, at + colour, share * g)
+        _finish(own, at + 2 * further, less, blurred, at + 2 * colour, share * b)
 
 
 @njit(**SHARED)
