@@ -1,5 +1,7 @@
 """How a blurred image changes with the motion, against its slow twin."""
 
+from dataclasses import replace
+
 from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.leaning import lean
@@ -34,7 +36,7 @@ def test_it_leans_as_its_slow_twin_does(seed, turn):
     blur.latent_part(planes)[:] = np.moveaxis(image, 2, 0)
     data, weight = rng.random((2, *blur.sweep.blurred_shape), np.float32)
     weight[:, :, CAMERA.width :] = 0
-    own, force = lean(blur, planes, data, weight)
+    own, force = lean(blur, blur.sweep, planes, data, weight)
     value, slope = blur_and_slope(blur.motion[:6].astype(np.float64), image, blur)
     # Where rounding moves a read into the next cell, slopes are other ones.
     size = np.abs(slope[:, :, 0]).max((0, 1))
@@ -44,3 +46,21 @@ def test_it_leans_as_its_slow_twin_does(seed, turn):
     pushes = (weight * (value - data))[..., None] * slope
     expected, room = pushes.sum((1, 2)), np.abs(pushes).sum((1, 2))
     assert np.quantile(np.abs(force - expected) / room, 0.95) < 5e-3
+
+
+def test_thinned_it_leans_as_with_so_few_instants():
+    """Before a wall, where all blocks are blurred alike and so have as many."""
+    rng, shift = np.random.default_rng(0), Motion(np.zeros(3), np.array([0.43, 0.21, 0]))
+    blur = blur_operator(shift, np.full((CAMERA.height, CAMERA.width), 2, np.float32), CAMERA)
+    thinned = blur.thinned(3)
+    (count,) = np.unique(np.rint(1 / thinned.layout.shares).astype(int))
+    assert count < blur.inverse_depth.shape[2]
+    few = replace(blur, inverse_depth=blur.inverse_depth[..., :count])
+    planes = rng.random(thinned.latent_shape, np.float32)
+    data, weight = rng.random((2, *thinned.blurred_shape), np.float32)
+    for told, expected in zip(
+        lean(blur, thinned, planes, data, weight),
+        lean(few, few.sweep, planes, data, weight),
+        strict=True,
+    ):
+        np.testing.assert_allclose(told, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())

@@ -34,7 +34,7 @@ def part(camera, motion, seed=0, sigma=0.01, scene=0, pace=None):
 
 def dense(found):
     """Give A, W, R [float64] of a posterior's quadratic, over the whole latent planes."""
-    sweep, problem = found.blur.sweep, found.problem
+    problem, sweep = found.problem, found.problem.sweep
     _, high, wide = sweep.latent_shape
     width = found.part.light.shape[1]
     columns = np.eye(high * wide, dtype=np.float32).reshape(-1, high, wide)
@@ -121,9 +121,10 @@ def test_the_adjoint_of_the_test_is_the_operator(converged):
     """The dense A of these tests agrees with the slow twin."""
     found = posterior(part(TINY, TRUTH), TRUTH)
     a, _, _ = dense(found)
-    matrix = oracle.blur_matrix(found.blur)
+    own = likelihood.OWN_SPACING * found.part.pace.spacing
+    matrix = oracle.matrix_of(found.blur, *oracle.thinned_displacements(found.blur, own))
     inner = np.random.default_rng(0).random(matrix.shape[1])
-    planes = np.zeros(found.blur.sweep.latent_shape)
+    planes = np.zeros(found.problem.sweep.latent_shape)
     high, wide, _ = found.blur.latent_shape
     found.blur.latent_part(planes)[0] = inner.reshape(high, wide)
     np.testing.assert_allclose(a @ planes[0].ravel(), matrix @ inner, atol=1e-4)

@@ -23,26 +23,27 @@ from depth_deblur_ros.core.lanes import (
     where_positive,
     WIDTH,
 )
+from depth_deblur_ros.core.sweep import Sweep
 from depth_deblur_ros.core.threads import on_threads, SHARED
 from numba import njit
 import numpy as np
 
 
 def lean(
-    blur: BlurOperator, latent: FloatImage, data: FloatImage, weight: FloatImage
+    blur: BlurOperator, sweep: Sweep, latent: FloatImage, data: FloatImage, weight: FloatImage
 ) -> tuple[FloatImage, FloatImage]:
     """
     Give the slope of the first plane of A L in p (6, H, W'), and a force of each row (H, 6).
 
-    latent (3, h, w); the force: <slope, weight (A L - data)> over all planes, data and weight
-    (3, H, W').
+    sweep: A of blur, thinned or not; latent (3, h, w); the force: <slope, weight (A L - data)>
+    over all planes, data and weight (3, H, W').
     """
-    layout, rows = blur.sweep.layout, data.shape[1]
+    layout, rows = sweep.layout, data.shape[1]
     own, force = np.empty((6, *data.shape[1:]), np.float32), np.empty((rows, 6), np.float32)
     told = layout.nearness, layout.flow, layout.shares, layout.cells
     ray = np.ascontiguousarray(blur.ray[-rows:])
-    frame = ray, blur.motion[6:8], blur.sweep.far, layout.unit
-    on_threads(_lean_rows, rows, latent, data, weight, told, frame, blur.sweep.room, own, force)
+    frame = ray, blur.motion[6:8], sweep.far, layout.unit
+    on_threads(_lean_rows, rows, latent, data, weight, told, frame, sweep.room, own, force)
     return own, force
 
 

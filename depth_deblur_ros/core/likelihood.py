@@ -41,6 +41,7 @@ LEAST_COUNT = 1e-4
 # Least sigma: for averaged values, as much as so few steps resolve; a real camera hides its noise,
 # and more is unexplained there.
 SIGMA_LEAST, SIGMA_MOST = {'linear': 0.002, 'srgb': 0.012}, 0.1
+OWN_SPACING = 0.8
 AROUND = 64  # px of noise beyond a part of the frame, so that its margin may change
 
 
@@ -56,7 +57,7 @@ class Scales:
 class Pace:
     """How finely the image step works: px from instant to instant, steps of a reweighting."""
 
-    spacing: float = 1.0  # of the longest blur
+    spacing: float = 1.0  # of the longest blur; OWN_SPACING of it of a block's own
     steps: int = 10  # conjugate gradients in each reweighting but the last
     # What so few steps leave undone changes its sign from one reweighting to the next, and the
     # motion with it.
@@ -115,7 +116,7 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
     """Run the image step on three planes: the image, and two of noise alone."""
     pace = part.pace
     blur = blur_operator(Motion.from_vector(p), part.depth, part.camera, pace.spacing)
-    sweep, transfer = blur.sweep, part.camera.transfer
+    sweep, transfer = blur.thinned(OWN_SPACING * pace.spacing), part.camera.transfer
     latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
     data, trust = _observed(part, sweep)
     for k in reversed(range(REWEIGHTINGS)):
@@ -198,10 +199,11 @@ def _noise(seed: int, height: int, width: int) -> FloatImage:
 
 def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
     """Give g (9,), (16), and J mu (6, H, W'), where rows see no other turn."""
-    blur, weight = found.blur, np.array([1, 0.5, 0.5], np.float32)[:, None, None]
-    light = np.zeros(blur.sweep.blurred_shape, np.float32)
+    blur, sweep = found.blur, found.problem.sweep
+    light = np.zeros(sweep.blurred_shape, np.float32)
     light[0, :, : found.part.light.shape[1]] = found.part.light
-    slope, force = lean(blur, found.latent, light, weight * found.problem.trust)
+    weight = np.array([1, 0.5, 0.5], np.float32)[:, None, None] * found.problem.trust
+    slope, force = lean(blur, sweep, found.latent, light, weight)
     force, yn = force.astype(np.float64), blur.ray[-len(force) :].astype(np.float64)
     g = np.concatenate([force.sum(0), yn @ force[:, :3]])
     return g / found.part.scales.sigma**2, slope
@@ -209,7 +211,7 @@ def slope_of(found: Posterior) -> tuple[Vector, FloatImage]:
 
 def curvature_of(found: Posterior, slope: FloatImage) -> Vector:
     """Give <J, W (J - A z)> / sigma^2 (9, 9), z how mu answers to a change of p [K75], (17)."""
-    sweep, problem = found.blur.sweep, found.problem
+    problem, sweep = found.problem, found.problem.sweep
     rest = np.empty_like(slope)
     for half in (slice(0, 3), slice(3, 6)):
         push = sweep.adjoint(problem.trust * slope[half])
