@@ -12,11 +12,10 @@ covariance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 import math
-from typing import TypeVar
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, InputError, Motion, Vector
@@ -25,11 +24,8 @@ from depth_deblur_ros.core.light import stored_from_light
 from depth_deblur_ros.core.likelihood import curvature_of, Pace, Part, posterior, settled, slope_of
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.start import Start
-from depth_deblur_ros.core.threads import on_threads
+from depth_deblur_ros.core.threads import each
 import numpy as np
-
-Of = TypeVar('Of')
-Result = TypeVar('Result')
 
 AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 MOST = 200_000  # px that are looked at; at half the size half of them, which show twice as much
@@ -89,7 +85,8 @@ def refine(
 
     p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
     level, pixels = _readable(Level(light, depth, camera), length(p), effort)
-    begun = _each(lambda k: _begun(_part(level, k, pixels, effort.pace), p), range(4))
+    # Side by side: they are too small for two threads to share one.
+    begun = each(lambda k: _begun(_part(level, k, pixels, effort.pace), p), range(4))
     pull = Pull(p, certainty, DISSENT[camera.transfer])
     return _moved(begun, pull, length, effort)
 
@@ -113,7 +110,7 @@ def _moved(
         p = p + move
         if length(move) < enough or k == effort.moves - 1:
             break
-        last, gs = gs.sum(0), np.array(_each(partial(_slope, p=p), parts))
+        last, gs = gs.sum(0), np.array(each(partial(_slope, p=p), parts))
         bend = _bent(bend, bends.sum(0), move, gs.sum(0) - last)
     return Motion.from_vector(p, np.linalg.inv(bend / soft + pull.certainty)[:6, :6])
 
@@ -127,17 +124,6 @@ def _begun(part: Part, p: Vector) -> tuple[Part, Vector, Vector]:
     found = settled(part, p)
     slope, image = slope_of(found)
     return found.part, slope, curvature_of(found, image)
-
-
-def _each(work: Callable[[Of], Result], parts: Sequence[Of]) -> list[Result]:
-    """Work on the parts side by side: they are too small for two threads to share one."""
-    found: dict[int, Result] = {}
-
-    def some(first: int, end: int) -> None:
-        found.update({k: work(parts[k]) for k in range(first, end)})
-
-    on_threads(some, len(parts))
-    return [found[k] for k in range(len(parts))]
 
 
 def _softening(gs: Vector, bends: Vector, dissent: float) -> float:

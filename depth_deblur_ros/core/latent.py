@@ -28,6 +28,7 @@ from depth_deblur_ros.core.light import light_ease, light_from_stored, stored_fr
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.quadratic import reweighted
 from depth_deblur_ros.core.sweep import Sweep
+from depth_deblur_ros.core.threads import each
 import numpy as np
 
 # px of mean blur for which half of a size is worth it (of the full one it always is), and what
@@ -91,7 +92,7 @@ def noise_sigma(stored: FloatImage) -> float:
 
 def picture_sigma(stored: FloatImage) -> float:
     """Estimate noise and what JPEG took [stored units], of a blurred image (H, W, 3)."""
-    return math.hypot(noise_sigma(stored), block_sigma(stored))
+    return math.hypot(*each(lambda estimate: estimate(stored), (noise_sigma, block_sigma)))
 
 
 def is_clean(stored: FloatImage, transfer: str) -> bool:

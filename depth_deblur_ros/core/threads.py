@@ -10,17 +10,20 @@ and what it has not begun when the caller is through, the caller has done itself
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from queue import Empty, SimpleQueue
 from threading import local, Thread
-from typing import Any
+from typing import Any, TypeVar
 
 from depth_deblur_ros.core.crew import Board, dismiss, empty_board, sched_yield
 from numba import config, njit
 from numba.core.compiler import Compiler
 import numpy as np
+
+Of = TypeVar('Of')
+Result = TypeVar('Result')
 
 ASKED, DONE = 0, 1  # places in a worker's turns: shares that it was given, that it did
 PATIENCE = 400  # looks at the turns, about half a microsecond each, before it sleeps
@@ -170,6 +173,17 @@ def on_threads(kernel: Callable[..., None], count: int, *data: Any) -> None:
     pieces = iter([(k * count // many, (k + 1) * count // many) for k in range(many)])
     share = partial(_work, kernel, pieces, data)
     _together(share, share, threads)
+
+
+def each(work: Callable[[Of], Result], items: Sequence[Of]) -> list[Result]:
+    """Give work(item) of all items, which threads take one after the other."""
+    found: dict[int, Result] = {}
+
+    def some(first: int, end: int) -> None:
+        found.update({k: work(items[k]) for k in range(first, end)})
+
+    on_threads(some, len(items))
+    return [found[k] for k in range(len(items))]
 
 
 def with_crew(loop: Callable[..., None], *data: Any) -> None:
