@@ -195,7 +195,7 @@ def quadratic():
     light, trust = light_from_stored(taken, 'srgb'), 1 / np.square(light_slope(taken, 'srgb'))
     first = sweep.widened(light)
     stored = stored_from_light(first, 'srgb')
-    problem = reweighted(stored, sweep, 'srgb', trust, WEIGHT)
+    problem = reweighted(first, sweep, 'srgb', trust, WEIGHT)
     matrix, shape = oracle.blur_matrix(blur), blur.latent_shape
     rim = sweep.room - blur.margin
     links, scale = (

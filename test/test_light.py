@@ -5,6 +5,7 @@ from depth_deblur_ros.core.light import (
     light_from_stored,
     light_slope,
     SLOPE_FLOOR,
+    stored_and_ease,
     stored_from_light,
 )
 from hypothesis import given
@@ -79,3 +80,11 @@ def test_the_slope_is_the_derivative_down_to_its_floor():
 def test_ease_is_one_over_the_squared_slope(transfer):
     slope = light_slope(FINE, transfer)
     np.testing.assert_allclose(light_ease(FINE, transfer), 1 / slope**2, rtol=1e-3)
+
+
+@transfers
+def test_stored_values_and_ease_come_as_one_by_one(transfer):
+    light = np.linspace(-0.1, 1.5, 3000, dtype=np.float32).reshape(3, 20, 50)[:, ::2]
+    stored, ease = stored_and_ease(light, transfer)
+    np.testing.assert_allclose(stored, stored_from_light(light, transfer), atol=1e-6)
+    np.testing.assert_allclose(ease, light_ease(stored, transfer), rtol=1e-3)

@@ -182,7 +182,7 @@ def restored_light(
         missing = sweep.missing(light, latent, sweep.taken)
         # What is saturated says only "at least this": drop it where the model gives more.
         trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
-        problem = reweighted(stored_from_light(latent, transfer), sweep, transfer, trust, weight)
+        problem = reweighted(latent, sweep, transfer, trust, weight)
         slope = problem.slope(missing, latent)
         latent = conjugate_gradients(problem, latent, slope, steps.within(k))
     r = sweep.room

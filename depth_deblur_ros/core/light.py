@@ -3,8 +3,8 @@ From stored values to light and back.
 
 Light adds up during the exposure, stored values do not: `transfer` (data.py) says how they were
 coded. Notation: v stored value 0..1, l(v) light 0..1, l'(v) its slope. [sRGB] IEC 61966-2-1:
-l = u^2.4 = u^3 u^(-3/5), u = (v + 0.055) / 1.055, and v = 1.055 l l^(-7/12) - 0.055, but for the
-darkest, where both are lines.
+l = u^2.4 = u^3 u^(-3/5), u = (v + 0.055) / 1.055, v = 1.055 l l^(-7/12) - 0.055, and so
+1 / l' = 1.055 / 2.4 l^(-7/12), but for the darkest, where l and v are lines.
 """
 
 from __future__ import annotations
@@ -52,6 +52,16 @@ def light_ease(stored: FloatImage, transfer: str) -> FloatImage:
     return _mapped(stored, _to_ease)
 
 
+def stored_and_ease(light: FloatImage, transfer: str) -> tuple[FloatImage, FloatImage]:
+    """Give stored values of light, as `stored_from_light`, and `light_ease` of them."""
+    if transfer == 'linear':
+        return stored_from_light(light, transfer), np.ones_like(light)
+    flat = np.ascontiguousarray(light, np.float32).reshape(-1)
+    stored, ease = np.empty_like(flat), np.empty_like(flat)
+    on_threads(_to_both, flat.size, flat, stored, ease)
+    return stored.reshape(light.shape), ease.reshape(light.shape)
+
+
 def _mapped(values: FloatImage, curve) -> FloatImage:  # type: ignore[no-untyped-def]
     """Send each value through a curve."""
     flat = np.ascontiguousarray(values, np.float32).reshape(-1)
@@ -77,6 +87,13 @@ def _slope(v):  # type: ignore[no-untyped-def]
     u = _base(v)
     slope = np.float32(2.4 / 1.055) * u * u * over_three_fifths(u)
     return max(slope, np.float32(SLOPE_FLOOR))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _coded(x, bright, over):  # type: ignore[no-untyped-def]
+    """Give the stored value of light x; bright: no less than KNEE, over: its power -7/12."""
+    curved = np.float32(1) - np.float32(1.055) * (np.float32(1) - bright * over)
+    return curved if x > np.float32(KNEE) else np.float32(GRADIENT) * x
 
 
 # Unsigned indices: numba checks signed ones, and a loop that does is not turned into vector code.
@@ -107,6 +124,14 @@ def _to_stored(first, end, values, found):  # type: ignore[no-untyped-def]
     for k in range(np.uintp(first), np.uintp(end)):
         x = _within(values[k])
         bright = max(x, np.float32(KNEE))
-        root = bright * over_seven_twelfths(bright)
-        curved = np.float32(1) - np.float32(1.055) * (np.float32(1) - root)
-        found[k] = curved if x > np.float32(KNEE) else np.float32(GRADIENT) * x
+        found[k] = _coded(x, bright, over_seven_twelfths(bright))
+
+
+@njit(fastmath=FINITE, **SHARED)
+def _to_both(first, end, values, stored, ease):  # type: ignore[no-untyped-def]
+    for k in range(np.uintp(first), np.uintp(end)):
+        x = _within(values[k])
+        bright = max(x, np.float32(KNEE))
+        over = over_seven_twelfths(bright)
+        stored[k] = _coded(x, bright, over)
+        ease[k] = min(np.float32((1.055 / 2.4) ** 2) * over * over, np.float32(SLOPE_FLOOR**-2))

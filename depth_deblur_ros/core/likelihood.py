@@ -121,9 +121,8 @@ def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
     data, trust = _observed(part, sweep)
     for k in reversed(range(REWEIGHTINGS)):
         sigma = part.scales.sigma
-        stored = stored_from_light(latent[:1], transfer)
         weight = np.float32(part.scales.prior * sigma**2)
-        problem = reweighted(stored, sweep, transfer, trust, weight)
+        problem = reweighted(latent[:1], sweep, transfer, trust, weight)
         push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
         push[1:] += sigma * _prior_noise(problem, part.seed)
         latent = conjugate_gradients(problem, latent, push, pace.steps if k else pace.last)

@@ -21,7 +21,7 @@ from depth_deblur_ros.core.lanes import (
     total,
     WIDTH,
 )
-from depth_deblur_ros.core.light import light_ease
+from depth_deblur_ros.core.light import stored_and_ease
 from depth_deblur_ros.core.powers import over_three_fifths
 from depth_deblur_ros.core.sweep import GUARD, Sweep
 from depth_deblur_ros.core.threads import on_threads, SHARED
@@ -56,12 +56,13 @@ class Quadratic:
 
 
 def reweighted(
-    stored: FloatImage, sweep: Sweep, transfer: str, trust: FloatImage, weight: np.float32
+    light: FloatImage, sweep: Sweep, transfer: str, trust: FloatImage, weight: np.float32
 ) -> Quadratic:
-    """Put the weights of (7) at the present image, stored values in planes (1 or 3, h, w)."""
+    """Put the weights of (7) at the present image, light in latent planes (1 or 3, h, w)."""
+    stored, ease = stored_and_ease(light, transfer)
     links = np.zeros((4, *stored.shape[1:]), np.float32)
     on_threads(_link_weights, stored.shape[1], stored, weight, links)
-    return Quadratic(sweep, trust, links, light_ease(stored, transfer))
+    return Quadratic(sweep, trust, links, ease)
 
 
 @njit(cache=True, nogil=True, inline='always')
