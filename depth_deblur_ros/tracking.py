@@ -226,22 +226,27 @@ class Tracker:
         return seconds, between.way(seconds, self._habits.readout * cadence.usual, doubt)
 
     def _alone(self, frame: RgbdFrame, params: SolverParams, start: Motion | None) -> DeblurResult:
-        """Solve the frame by itself, from a further start where there is one."""
+        """Solve the frame by itself, from a further start where there is one; see `_restored`."""
+        if self._solve is deblur:
+            return deblur(frame, params, start=start, restore=False)
         return self._solve(frame, params, start=start) if start else self._solve(frame, params)
 
     def _restored(
         self, frame: RgbdFrame, params: SolverParams, alone: DeblurResult, joined: Joined
     ) -> DeblurResult:
-        """Restore the image anew where the motion that was settled is not the frame's own."""
-        result, seen = joined.result, joined.seen
+        """Restore the image under the frame's own motion, or the settled one if that differs."""
+        result, motion = joined.result, alone.motion
         wanted = params.mode != 'motion' and result.outcome is Outcome.SOLVED
-        if self._solve is not deblur or not wanted or seen is None:
+        if self._solve is not deblur or not wanted:
             return result
-        own, settled = alone.motion.vector, seen.vector
-        off = min(blur_length(settled + s * own, result.depth, frame.camera) for s in (1, -1))
-        if off < OTHER_PX:
+        if joined.seen is not None:
+            own, settled = motion.vector, joined.seen.vector
+            apart = (settled + s * own for s in (1, -1))
+            off = min(blur_length(p, result.depth, frame.camera) for p in apart)
+            motion = joined.seen if off >= OTHER_PX else motion
+        if motion is alone.motion and alone.outcome is not Outcome.SOLVED:
             return result
-        known = restore_known(replace(frame, depth=result.depth), seen, params)
+        known = restore_known(replace(frame, depth=result.depth), motion, params)
         return replace(result, image=known.image, seconds=result.seconds + known.seconds)
 
 

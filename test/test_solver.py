@@ -129,6 +129,14 @@ def same(a, b, but=('seconds',)):
             np.testing.assert_array_equal(one, other)
 
 
+def test_to_deblur_is_to_find_the_motion_and_then_to_restore(small_frame, small_result):
+    found = deblur(small_frame, restore=False)
+    assert found.image is small_frame.image
+    same(found, small_result, but=('seconds', 'image'))
+    known = restore_known(replace(small_frame, depth=found.depth), found.motion)
+    np.testing.assert_array_equal(known.image, small_result.image)
+
+
 @each_motion
 def test_a_known_motion_is_found_in_a_rendered_room(room, solved, name):
     result = solved(name)

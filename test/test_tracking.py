@@ -212,23 +212,35 @@ def test_what_is_remembered_can_be_saved():
         assert one.exposure == two.exposure
 
 
-def test_the_image_is_restored_anew_under_a_motion_that_is_not_its_own(monkeypatch):
-    solve, restored = Knowing(exposure=0.01), []
+def test_the_image_is_restored_once_under_the_motion_that_was_settled(monkeypatch):
+    """The frame's own, or its neighbours' where it fails by itself; in mode motion never."""
+    knowing, restored = Knowing(exposure=0.01), []
+
+    def solve(frame, params, *, start=None, restore=True):
+        assert not restore
+        return knowing(frame, params, start=start)
 
     def restore(frame, motion, params):
         restored.append(motion.vector)
-        return replace(solve(frame, params), image=1 - frame.image, seconds=0.5)
+        return replace(knowing(frame, params), image=1 - frame.image, seconds=0.5)
 
     monkeypatch.setattr(tracking, 'deblur', solve)
     monkeypatch.setattr(tracking, 'restore_known', restore)
-    tracker, frames = Tracker(solve), [frame(i, exposure=0.01) for i in range(5)]
-    for f, n in itertools.pairwise(frames):
-        assert tracker.follow(f, SolverParams(mode='fast'), n).result.image is f.image
+    tracker, frames = Tracker(solve), [frame(i, exposure=0.01) for i in range(6)]
+    tracker.follow(frames[0], SolverParams(mode='motion'), frames[1])
     assert not restored
-    solve.exposure = 1e-9  # the last frame fails by itself
-    found = tracker.follow(frames[4], SolverParams(mode='fast')).result
-    np.testing.assert_allclose(found.motion.vector, restored[0], atol=1e-4)
-    np.testing.assert_array_equal(found.image, 1 - frames[4].image)
+    for f, n in itertools.pairwise(frames[1:]):
+        found = tracker.follow(f, SolverParams(mode='fast'), n).result
+        np.testing.assert_array_equal(found.image, 1 - f.image)
+        own = 0.01 * rate(knowing.time(f.stamp_ns))
+        off = min(np.linalg.norm(restored[-1][:3] + s * own) for s in (1, -1))
+        assert off < 0.15 * np.linalg.norm(own)
+    assert len(restored) == 4
+    knowing.exposure = 1e-9  # the last frame fails by itself
+    found = tracker.follow(frames[5], SolverParams(mode='fast')).result
+    assert len(restored) == 5
+    np.testing.assert_allclose(found.motion.vector, restored[-1], atol=1e-4)
+    np.testing.assert_array_equal(found.image, 1 - frames[5].image)
     assert found.seconds >= 0.5
 
 

@@ -51,15 +51,22 @@ BRIEF = replace(NOISY, pixels=52_000, moves=2, enough=0.4, doubt=1.15, pace=PACE
 
 
 def deblur(
-    frame: RgbdFrame, params: SolverParams | None = None, *, start: Motion | None = None
+    frame: RgbdFrame,
+    params: SolverParams | None = None,
+    *,
+    start: Motion | None = None,
+    restore: bool = True,
 ) -> DeblurResult:
     """
     Find the sharp image and the camera's motion during the exposure of one frame.
 
-    start: a further motion to start from (the previous frame's, say). Pure: the same input gives
-    the same output, but for seconds. One image cannot tell the sign of the motion, and no motion
-    has none: sign_resolved is False. Image and depth of a lens with distortion are undistorted
-    first, and come back so. Raises InputError when all depth is missing.
+    start: a further motion to start from (the previous frame's, say). restore: if not, the motion
+    is found as the mode asks, and the image stays as it was taken, for `restore_known`.
+
+    Pure: the same input gives the same output, but for seconds. One image cannot tell the sign of
+    the motion, and no motion has none: sign_resolved is False. Image and depth of a lens with
+    distortion are undistorted first, and come back so. Raises InputError when all depth is
+    missing.
     """
     params, frame = params or SolverParams(), undistorted(frame)
     began = time.monotonic()
@@ -67,14 +74,14 @@ def deblur(
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
         if params.method == 'paper':
             found, energies = _alternated(frame, depth, params)
-            result = _finish(frame, depth, found, params, began)
+            result = _finish(frame, depth, found, params, began, restore=restore)
             return replace(result, energies=energies)
         grey = _grey(frame.image, _channels(frame.image))
         found = blind_start(grey, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
             effort = _effort(frame, params.mode, known=start is not None)
             found = replace(found, motion=_settled(frame, depth, found, effort), scales=())
-        return _finish(frame, depth, found, params, began)
+        return _finish(frame, depth, found, params, began, restore=restore)
 
 
 def _effort(frame: RgbdFrame, mode: str, *, known: bool) -> Effort | None:
@@ -116,10 +123,16 @@ def restore_known(
 
 
 def _finish(
-    frame: RgbdFrame, depth: FloatImage, found: Start, params: SolverParams, began: float
+    frame: RgbdFrame,
+    depth: FloatImage,
+    found: Start,
+    params: SolverParams,
+    began: float,
+    *,
+    restore: bool = True,
 ) -> DeblurResult:
     """Restore the image where there is a motion and the mode asks for it; sum up."""
-    wanted = found.outcome is Outcome.SOLVED and params.mode != 'motion'
+    wanted = restore and found.outcome is Outcome.SOLVED and params.mode != 'motion'
     return DeblurResult(
         image=_restored(frame, depth, found.motion, params) if wanted else frame.image,
         depth=depth,
