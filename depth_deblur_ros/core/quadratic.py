@@ -98,14 +98,14 @@ def _link_weights(first, end, stored, weight, links):  # type: ignore[no-untyped
                 row[x] = pull * _weight(mean[x])
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _pull(links, at, u, p, n, ease, off):  # type: ignore[no-untyped-def]
     """Give how one link draws the values at p away from those at n; theirs of ease: off before."""
     least = smaller(load(ease, p - off), load(ease, n - off))
     return load(links, at) * (load(u, p) - load(u, n)) * least
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _pulls(c, place, u, links, ease, beside, below):  # type: ignore[no-untyped-def]
     """
     Give how all links draw a block of channel c, and those that also draw the block beside it.
@@ -131,7 +131,7 @@ def _pulls(c, place, u, links, ease, beside, below):  # type: ignore[no-untyped-
     return drawn, (right, aslant, back)
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _added(p, drawn, x, ease, off, out, sums):  # type: ignore[no-untyped-def]
     """Add to a block of out, and what it then is to the sums."""
     q = load(out, p) + drawn
