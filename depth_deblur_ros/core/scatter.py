@@ -21,14 +21,14 @@ def _add(plane, p, lanes):  # type: ignore[no-untyped-def]
     store(plane, p, load(plane, p) + lanes)
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _with(held, w, value):  # type: ignore[no-untyped-def]
     """Add what a value gives the corners of a cell to what is held for them."""
     above = held[0] + w[0] * value, held[1] + w[1] * value
     return above[0], above[1], held[2] + w[2] * value, held[3] + w[3] * value
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _leave(plane, p, wide, held):  # type: ignore[no-untyped-def]
     """Add to a row and the one below, each once: what overlaps has to wait for its turn."""
     none = splat(np.float32(0))
@@ -38,7 +38,7 @@ def _leave(plane, p, wide, held):  # type: ignore[no-untyped-def]
     plane[p + wide + WIDTH] += last_lane(held[3])
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _leave_all(strip, p, wide, plane, held):  # type: ignore[no-untyped-def]
     if p >= 0:
         _leave(strip, p, wide, held[0])

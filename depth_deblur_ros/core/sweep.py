@@ -144,14 +144,14 @@ def sweep_of(seen: FloatImage, flow: FloatImage, margin: int, spacing: float = 0
     return Sweep(laid_out(seen, flow, spacing, far), far, margin + GUARD)
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _row(plane, p):  # type: ignore[no-untyped-def]
     """Give a block and the one that begins at the next element, which is read; one is enough."""
     beyond = load(plane, p + 1)
     return next_lane(beyond, splat(plane[p])), beyond
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _read(plane, p, wide, w):  # type: ignore[no-untyped-def]
     (a, b), (c, d) = _row(plane, p), _row(plane, p + wide)
     return w[0] * a + w[1] * b + w[2] * c + w[3] * d
@@ -171,7 +171,7 @@ def _read_each(plane, p, wide, places):  # type: ignore[no-untyped-def]
     return load(places, 2 * WIDTH)
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _finish(own, near, less, blurred, at, found):  # type: ignore[no-untyped-def]
     store(blurred, at, load(own, near) - found if less else load(own, near) * found)
 
