@@ -47,7 +47,7 @@ def lean(
     return own, force
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _rise(d):  # type: ignore[no-untyped-def]
     """Give the slope of tent(u - m) in u at d = u - m; where two meet, that of the right side."""
     zero, one = splat(np.float32(0)), splat(np.float32(1))
@@ -55,7 +55,7 @@ def _rise(d):  # type: ignore[no-untyped-def]
     return where_positive(zero - d, left, where_positive(one - d, zero - one, zero))
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _in_cell(latent, p, wide, u, v):  # type: ignore[no-untyped-def]
     """Give value and slopes where all pixels of a block read in one cell."""
     above, below = load(latent, p), load(latent, p + wide)
@@ -64,7 +64,7 @@ def _in_cell(latent, p, wide, u, v):  # type: ignore[no-untyped-def]
     return above + u * top + v * down, top + v * (low - top), down
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _in_cells(latent, p, plane, wide, place):  # type: ignore[no-untyped-def]
     """Give value and slopes of the three planes where they read in a few."""
     u, v, columns, rows = place
@@ -81,7 +81,7 @@ def _in_cells(latent, p, plane, wide, place):  # type: ignore[no-untyped-def]
     return r, g, b
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _mixed(seen, weights, here):  # type: ignore[no-untyped-def]
     return seen[0] + weights[0] * here, seen[1] + weights[1] * here, seen[2] + weights[2] * here
 
@@ -101,7 +101,7 @@ def _each(latent, p, wide, places):  # type: ignore[no-untyped-def]
     return load(places, 2 * WIDTH), load(places, 3 * WIDTH), load(places, 4 * WIDTH)
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _added(sums, seen, share, back, w):  # type: ignore[no-untyped-def]
     """Add what one instant shows of a plane: value, then each slope times -t and -t w."""
     value, across, down = seen
@@ -115,7 +115,7 @@ def _added(sums, seen, share, back, w):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _slopes(sums, xn, yn, focal, unit):  # type: ignore[no-untyped-def]
     """Give the slope in p of a block, (3)."""
     one, fx, fy = splat(np.float32(1)), splat(focal[0]), splat(focal[1])
@@ -125,7 +125,7 @@ def _slopes(sums, xn, yn, focal, unit):  # type: ignore[no-untyped-def]
     return *turn, xn * gy - yn * gx, hx, hy, zero - xn * hx - yn * hy
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _block(y, k, latent, told, sizes, far, places):  # type: ignore[no-untyped-def]
     """Give what `_added` adds up of each plane of a block."""
     nearness, flow, shares, _ = told
@@ -157,7 +157,7 @@ def _block(y, k, latent, told, sizes, far, places):  # type: ignore[no-untyped-d
     return r, g, b
 
 
-@njit(cache=True, nogil=True, inline='always')
+@njit(cache=True, nogil=True)
 def _pushed(push, slopes, value, at, data, weight):  # type: ignore[no-untyped-def]
     """Add what a plane of a block pushes."""
     missing = load(weight, at) * (value - load(data, at))
