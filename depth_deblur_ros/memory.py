@@ -9,7 +9,7 @@ import mmap
 # process, so that the next one does not pay for its pages again. M_ARENA_MAX, a count: so much is
 # kept in each arena, and a thread of every new worker may open one.
 _MALLOPT = ((-1, 1 << 28), (-3, 1 << 25), (-2, 1 << 24), (-8, 2))
-_PIECES, _PIECE = 10, 1 << 24  # bytes; what the images of a VGA frame come and go in
+_PIECES, _PIECE = 10, 1 << 24  # how many, bytes of each: what a VGA frame's images come and go in
 
 
 def keep_freed_memory() -> None:

@@ -34,6 +34,7 @@ def conjugate_gradients(
     sweep, rows = problem.sweep, latent.shape[1]
     d, q = sweep.directions
     sums = np.zeros((rows, 2), np.float32), np.zeros(rows, np.float32), np.zeros(2, np.float32)
+    # What d holds from before counts for nothing: the first pace is 0, 0.
     planes = latent, slope, d, q, problem.links, problem.ease
     blurred = problem.trust, sweep.taken, sweep.strips
     with_crew(_descend, limit, planes, blurred, sweep.parts(), sums)

@@ -81,7 +81,7 @@ def store(typing: Any, array: Any, index: Any, lanes: Any) -> Any:
 
 @_instruction  # type: ignore[untyped-decorator]
 def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Let an element of a contiguous array come nearer the core; it need not exist."""
+    """Let an element of a contiguous float32 array come nearer the core; it need not exist."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         place = _address(context, builder, signature.args, values, ir.IntType(8))
@@ -92,7 +92,7 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
         builder.call(function, [place, _INDEX(0), _INDEX(2), _INDEX(1)])
         return context.get_dummy_value()
 
-    return (types.void(array, types.intp), build) if _fits(array, array.dtype) else None
+    return (types.void(array, types.intp), build) if _fits(array) else None
 
 
 _SHORTS = ir.VectorType(ir.IntType(16), WIDTH)

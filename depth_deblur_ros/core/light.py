@@ -55,7 +55,8 @@ def light_ease(stored: FloatImage, transfer: str) -> FloatImage:
 def stored_and_ease(light: FloatImage, transfer: str) -> tuple[FloatImage, FloatImage]:
     """Give stored values of light, as `stored_from_light`, and `light_ease` of them."""
     if transfer == 'linear':
-        return stored_from_light(light, transfer), np.ones_like(light)
+        stored = stored_from_light(light, transfer)
+        return stored, light_ease(stored, transfer)
     flat = np.ascontiguousarray(light, np.float32).reshape(-1)
     stored, ease = np.empty_like(flat), np.empty_like(flat)
     on_threads(_to_both, flat.size, flat, stored, ease)

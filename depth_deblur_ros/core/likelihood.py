@@ -41,7 +41,7 @@ LEAST_COUNT = 1e-4
 # Least sigma: for averaged values, as much as so few steps resolve; a real camera hides its noise,
 # and more is unexplained there.
 SIGMA_LEAST, SIGMA_MOST = {'linear': 0.002, 'srgb': 0.012}, 0.1
-OWN_SPACING = 0.8
+OWN_SPACING = 0.8  # px from instant to instant of a block's own blur, for each of Pace.spacing
 AROUND = 64  # px of noise beyond a part of the frame, so that its margin may change
 
 
@@ -57,7 +57,7 @@ class Scales:
 class Pace:
     """How finely the image step works: px from instant to instant, steps of a reweighting."""
 
-    spacing: float = 1.0  # of the longest blur; OWN_SPACING of it of a block's own
+    spacing: float = 1.0  # of the longest blur
     steps: int = 10  # conjugate gradients in each reweighting but the last
     # What so few steps leave undone changes its sign from one reweighting to the next, and the
     # motion with it.
