@@ -9,6 +9,7 @@ from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.descent import conjugate_gradients
 from depth_deblur_ros.core.latent import (
+    FEW,
     LatentSteps,
     noise_sigma,
     restore_coarse_to_fine,
@@ -22,7 +23,7 @@ from depth_deblur_ros.core.quadratic import (
     reweighted,
     sum_rows,
 )
-from depth_deblur_ros.core.sweep import GUARD
+from depth_deblur_ros.core.sweep import GUARD, Sweep
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -214,6 +215,31 @@ def quadratic():
         return conjugate_gradients(problem, first.copy(), slope, limit)
 
     return first, value, after
+
+
+def test_a_slope_is_the_same_when_only_the_prior_of_another_is_exchanged():
+    rng = np.random.default_rng(0)
+    blur = blur_operator(SIDEWAYS, DEPTH, CAMERA)
+    sweep, planes = blur.sweep, np.moveaxis(cards(0), 2, 0)
+    light = sweep.blurred_planes(cards(1))
+    trust = 0.5 + rng.random(sweep.blurred_shape, np.float32)
+    first, latent = (sweep.widened(k * planes + 0.1) for k in (0.5, 0.8))
+    before, problem = (reweighted(x, sweep, 'srgb', trust, 300 * WEIGHT) for x in (first, latent))
+    missing = sweep.missing(light, latent)
+    expected = problem.slope(missing, latent)
+    found = problem.slope_after(before, before.slope(missing, latent), latent)
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    assert np.abs(before.slope(missing, latent) - expected).max() > 0.01 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize('share', [0.01, 0.05])
+def test_what_is_burnt_is_looked_at_again_where_it_is_much(monkeypatch, share):
+    """Each time that it is, the latent image is blurred once more."""
+    rng, calls, missing = np.random.default_rng(0), [], Sweep.missing
+    monkeypatch.setattr(Sweep, 'missing', lambda *told: calls.append(told) or missing(*told))
+    taken = np.where(rng.random((48, 64, 1)) < share, np.float32(1), 0.9 * cards(0))
+    restored(taken, blur_operator(SIDEWAYS, DEPTH, CAMERA), 'srgb', 0.004, STEPS)
+    assert len(calls) == (STEPS.outer if share > FEW else 1)
 
 
 def test_no_step_of_the_conjugate_gradients_raises_the_quadratic(quadratic):

@@ -35,6 +35,7 @@ import numpy as np
 # noise adds to them in brief
 SHOWN, SHOWN_LATER = 3.0, 6.0
 SATURATED = 0.99  # stored values above may stand for any amount of light
+FEW = 0.02  # share of them up to which the first guess tells which of them count
 # px of the longest blur, and of a block's own, from one instant of the exposure to the next, and
 # what noise adds to them in brief
 SPACING, OWN_SPACING = 1.5, 0.5
@@ -174,16 +175,20 @@ def restored_light(
     light = light_from_stored(stored, transfer)
     full, noise = stored >= SATURATED, light_ease(stored, transfer)
     noise[:, :, width:] = 0
-    saturated = bool(full.any())
+    saturated = np.count_nonzero(full) / full.size
     start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for k in range(steps.outer):
-        missing = sweep.missing(light, latent, sweep.taken)
-        # What is saturated says only "at least this": drop it where the model gives more.
-        trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
-        problem = reweighted(latent, sweep, transfer, trust, weight)
-        slope = problem.slope(missing, latent)
+        if k == 0 or saturated > FEW:
+            missing = sweep.missing(light, latent, sweep.taken)
+            # What is saturated says only "at least this": drop it where the model gives more.
+            trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
+            problem = reweighted(latent, sweep, transfer, trust, weight)
+            slope = problem.slope(missing, latent)
+        else:
+            before, problem = problem, reweighted(latent, sweep, transfer, trust, weight)
+            slope = problem.slope_after(before, slope, latent)
         latent = conjugate_gradients(problem, latent, slope, steps.within(k))
     r = sweep.room
     return np.asarray(cv2.merge([*latent[:, r : r + height, r : r + width]]), np.float32)

@@ -104,35 +104,58 @@ class Posterior:
 
 def settled(part: Part, p: Vector) -> Posterior:
     """As `posterior`, with noise and prior that follow what is left of the data and the image."""
-    return _posterior(part, p, follow=True)
+    blur, sweep, latent = _unblurred(part, p)
+    data, trust = _observed(part, sweep)
+    missing = sweep.missing(data, latent)
+    for k in reversed(range(REWEIGHTINGS)):
+        sigma, steps = part.scales.sigma, part.pace.steps if k else part.pace.last
+        problem = _weighted(part, sweep, trust, latent)
+        push = problem.slope(missing, latent)
+        push[1:] += sigma * _prior_noise(problem, part.seed)
+        latent = conjugate_gradients(problem, latent, push, steps)
+        if k:
+            missing = sweep.missing(data, latent, missing)
+            missing[1:] -= data[1:]
+            part = _followed(part, problem, latent, missing)
+            data, trust = _observed(part, sweep)
+            change = part.scales.sigma / sigma
+            latent[1:] *= change
+            missing[1:] = change * missing[1:] + data[1:]
+    return Posterior(part, blur, problem, latent)
 
 
 def posterior(part: Part, p: Vector) -> Posterior:
     """Find mu and two samples s for a motion p (9,), by rows."""
-    return _posterior(part, p, follow=False)
+    blur, sweep, latent = _unblurred(part, p)
+    data, trust = _observed(part, sweep)
+    problem = _weighted(part, sweep, trust, latent)
+    push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
+    noise = part.scales.sigma * _prior_noise(problem, part.seed)
+    push[1:] += noise
+    for k in reversed(range(REWEIGHTINGS)):
+        steps = part.pace.steps if k else part.pace.last
+        latent = conjugate_gradients(problem, latent, push, steps)
+        if k:
+            before, problem = problem, _weighted(part, sweep, trust, latent)
+            push = problem.slope_after(before, push, latent)
+            earlier, noise = noise, part.scales.sigma * _prior_noise(problem, part.seed)
+            push[1:] += noise - earlier
+    return Posterior(part, blur, problem, latent)
 
 
-def _posterior(part: Part, p: Vector, *, follow: bool) -> Posterior:
-    """Run the image step on three planes: the image, and two of noise alone."""
+def _unblurred(part: Part, p: Vector) -> tuple[BlurOperator, Sweep, FloatImage]:
+    """Lay out the blur of a motion, and what the planes begin with: the image, and no noise."""
     pace = part.pace
     blur = blur_operator(Motion.from_vector(p), part.depth, part.camera, pace.spacing)
-    sweep, transfer = blur.thinned(OWN_SPACING * pace.spacing), part.camera.transfer
-    latent = sweep.widened(np.stack([part.light, 0 * part.light, 0 * part.light]))
-    data, trust = _observed(part, sweep)
-    for k in reversed(range(REWEIGHTINGS)):
-        sigma = part.scales.sigma
-        weight = np.float32(part.scales.prior * sigma**2)
-        problem = reweighted(latent[:1], sweep, transfer, trust, weight)
-        push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
-        push[1:] += sigma * _prior_noise(problem, part.seed)
-        latent = conjugate_gradients(problem, latent, push, pace.steps if k else pace.last)
-        if follow and k:
-            missing = sweep.missing(data, latent)
-            missing[1:] -= data[1:]
-            part = _followed(part, problem, latent, missing)
-            data, trust = _observed(part, sweep)
-            latent[1:] *= part.scales.sigma / sigma
-    return Posterior(part, blur, problem, latent)
+    sweep = blur.thinned(OWN_SPACING * pace.spacing)
+    none = np.zeros_like(part.light)
+    return blur, sweep, sweep.widened(np.stack([part.light, none, none]))
+
+
+def _weighted(part: Part, sweep: Sweep, trust: FloatImage, latent: FloatImage) -> Quadratic:
+    """Weigh the prior as the present image does."""
+    weight = np.float32(part.scales.prior * part.scales.sigma**2)
+    return reweighted(latent[:1], sweep, part.camera.transfer, trust, weight)
 
 
 def _observed(part: Part, sweep: Sweep) -> tuple[FloatImage, FloatImage]:

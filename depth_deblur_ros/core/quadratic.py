@@ -49,10 +49,27 @@ class Quadratic:
     def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
         """Give minus the gradient at a latent image; missing = B - A latent."""
         strips = self.sweep.scatter(np.multiply(self.trust, missing, out=self.sweep.taken))
-        r, products = np.zeros_like(latent), np.empty((latent.shape[1], 2), np.float32)
-        told = self.links, self.ease, np.float32(-1), r, products
-        on_threads(sum_rows, len(products), strips, missing.shape[1], latent, *told)
-        return r
+        return self._added(-1, latent, strips, np.zeros_like(latent))
+
+    def slope_after(self, before: Quadratic, slope: FloatImage, latent: FloatImage) -> FloatImage:
+        """
+        Give minus the gradient from that (3, h, w) with the weights before; it is written over.
+
+        Trust must be the same: then only what the prior adds is another, and nothing is blurred.
+        """
+        _, room = self.sweep.directions
+        without = before._added(1, latent, slope[None], room)
+        return self._added(-1, latent, without[None], slope)
+
+    def _added(
+        self, sign: int, latent: FloatImage, strips: FloatImage, out: FloatImage
+    ) -> FloatImage:
+        """Write strips of A' and sign times the prior's part of a latent image into out."""
+        products = np.empty((latent.shape[1], 2), np.float32)
+        told = self.links, self.ease, np.float32(sign), out, products
+        height = self.sweep.blurred_shape[1]
+        on_threads(sum_rows, len(products), strips, height, latent, *told)
+        return out
 
 
 def reweighted(
