@@ -100,22 +100,44 @@ def blur_matrix(blur):
     return matrix_of(blur, *displacements(blur), 1 / blur.inverse_depth.shape[2])
 
 
-def matrix_of(blur, dx, dy, share):
+def matrix_of(blur, dx, dy, share, slack=0.0):
     """Give A (H W, h w) that reads at these places, with these shares of the exposure."""
     height, width, _ = blur.inverse_depth.shape
     high, wide, _ = blur.latent_shape
     y, x = np.indices((height, width))
     far = blur.margin - 1
-    px = x[..., None] + blur.margin + np.clip(dx, -far, far)
-    py = y[..., None] + blur.margin + np.clip(dy, -far, far)
-    rows = np.broadcast_to((y * width + x)[..., None], px.shape)
+    dx, dy = np.clip(dx, -far, far), np.clip(dy, -far, far)
+    left, top = cells(dx, dy, slack)
+    rows = np.broadcast_to((y * width + x)[..., None], dx.shape)
     parts = []
+    u, v = dx - left, dy - top
     for down, right in np.ndindex(2, 2):
-        cell_x, cell_y = np.floor(px) + right, np.floor(py) + down
-        weight = (1 - np.abs(px - cell_x)) * (1 - np.abs(py - cell_y)) * share
-        parts.append((weight.ravel(), rows.ravel(), (cell_y * wide + cell_x).ravel()))
+        weight = (u if right else 1 - u) * (v if down else 1 - v) * share
+        cell_x, cell_y = x[..., None] + left + right, y[..., None] + top + down
+        place = (cell_y + blur.margin) * wide + cell_x + blur.margin
+        parts.append((weight.ravel(), rows.ravel(), place.ravel()))
     values, i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
     return coo_matrix((values, (i, j.astype(int))), (height * width, high * wide)).tocsr()
+
+
+def cells(dx, dy, slack):
+    """
+    Give the upper left offset that each pixel reads at, (H, W, N) along x and y.
+
+    Its own, or that of its block of 16 columns if none of them lies farther beyond than slack.
+    """
+    found = np.floor(dx), np.floor(dy)
+    for y, left, i in np.ndindex(len(dx), dx.shape[1] // 16, dx.shape[2]):
+        block = np.s_[y, 16 * left : 16 * left + 16, i]
+        common = [np.floor(d[block].min()) for d in (dx, dy)]
+        for k, d in enumerate((dx[block], dy[block])):
+            if np.floor(d.max()) > common[k]:
+                common[k] = np.floor(d.min() + slack)
+        beyond = max((d[block] - c).max() - 1 for d, c in zip((dx, dy), common, strict=True))
+        if slack and beyond < slack:
+            for axis, own in zip(found, common, strict=True):
+                axis[block] = own
+    return found
 
 
 def through(matrix, image, shape):

@@ -198,16 +198,16 @@ def test_pixels_that_would_read_beyond_the_latent_image_read_its_rim(v):
     np.testing.assert_allclose(blur.adjoint(image), slow, atol=TOL * max(1, float(slow.max())))
 
 
-@given(seed=seeds, spacing=st.floats(0.3, 4), count=threads)
+@given(seed=seeds, spacing=st.floats(0.3, 4), slack=st.sampled_from([0, 0.2]), count=threads)
 @few
-def test_a_thinned_operator_is_its_slow_twin(seed, spacing, count):
+def test_a_thinned_operator_is_its_slow_twin(seed, spacing, slack, count):
     """Near boards move by many px, the wall behind by few: blocks have 3 to N instants."""
     rng = np.random.default_rng(seed)
     depth, v = steps_in_depth(rng, (48, 64)), rng.normal(0, 0.15, 3)
     blur = blur_operator(Motion(rng.normal(0, 0.01, 3), v), depth, CAMERA)
-    matrix = oracle.matrix_of(blur, *oracle.thinned_displacements(blur, spacing))
+    matrix = oracle.matrix_of(blur, *oracle.thinned_displacements(blur, spacing), slack)
     latent, image = rng.random(blur.latent_shape, np.float32), rng.random((48, 64, 3), np.float32)
-    sweep = blur.thinned(spacing)
+    sweep = blur.thinned(spacing, slack)
     planes, taken = np.zeros(sweep.latent_shape, np.float32), sweep.blurred_planes(image)
     blur.latent_part(planes)[:] = np.moveaxis(latent, 2, 0)
     with at_most(count):
@@ -217,6 +217,23 @@ def test_a_thinned_operator_is_its_slow_twin(seed, spacing, count):
     slow = oracle.through(matrix.T, image, latent.shape)
     back = np.moveaxis(blur.latent_part(back), 0, 2)
     np.testing.assert_allclose(back, slow, atol=TOL * max(1, float(slow.max())))
+
+
+def test_slack_spares_cells_and_reads_what_is_even_as_before():
+    """A roll drifts by a tenth of a pixel along a block; what goes on evenly, slack goes on."""
+    turn, depth = (
+        Motion(np.array([0.02, 0.1, 0.05]), np.zeros(3)),
+        np.full((48, 64), 2, np.float32),
+    )
+    blur = blur_operator(turn, depth, CAMERA, spacing=2.0)
+    loose, exact = blur.thinned(0, 0.2), blur.thinned(0)
+    wide = [np.mean(sweep.layout.cells[..., 2:].max(-1) > 2) for sweep in (exact, loose)]
+    assert wide[1] < 0.1 * wide[0]
+    y, x = np.indices(exact.latent_shape[1:], np.float32)
+    slope = np.array([0.01 * x, 0.02 * y, 0.3 + 0.01 * x - 0.01 * y], np.float32)
+    one = np.ones(exact.blurred_shape, np.float32)
+    there, same = (sweep.gather(slope, one) for sweep in (loose, exact))
+    np.testing.assert_allclose(there, same, atol=TOL)
 
 
 @given(drawn=blurs())

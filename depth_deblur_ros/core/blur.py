@@ -62,14 +62,14 @@ class BlurOperator:
         """A laid out for blocks of pixels of colour planes."""
         return self.thinned(0)
 
-    def thinned(self, spacing: float) -> Sweep:
-        """As `sweep`, with one instant for `spacing` px of a block's own blur; 0: all N."""
+    def thinned(self, spacing: float, slack: float = 0.0) -> Sweep:
+        """As `sweep`, but with a spacing and a slack, as `sweep_of` explains."""
         height, width = self.inverse_depth.shape[:2]
         seen = np.moveaxis(self.inverse_depth, 2, 1)
         if width < whole_blocks(width):
             seen = np.pad(seen, [(0, 0), (0, 0), (0, whole_blocks(width) - width)], 'edge')
         flow = flow_rows(self.ray, self.motion, (height, width))
-        return sweep_of(np.ascontiguousarray(seen), flow, self.margin, spacing)
+        return sweep_of(np.ascontiguousarray(seen), flow, self.margin, spacing, slack)
 
     def apply(self, latent: FloatImage) -> FloatImage:
         """Blur: A L, (5) of docs/method.md."""

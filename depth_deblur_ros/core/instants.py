@@ -49,12 +49,15 @@ class Layout:
     unit: np.float32  # 1/m, one part of nearness
 
 
-def laid_out(seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32) -> Layout:
+def laid_out(
+    seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32, slack: float
+) -> Layout:
     """
     Lay out inverse depth seen (H, N, W') [1/m] for blocks, and flow (W' + 8 H,).
 
     spacing: px of its own longest blur for which a block has an instant, of at most N; 0: all N.
-    far: px, the longest displacement along an axis.
+    far: px, the longest displacement along an axis. slack: px beyond a cell of 2 x 2 offsets where
+    its bilinear surface still serves.
     """
     height, samples, width = seen.shape
     # In sixteen bits the longest displacement is off by less than a hundred thousandth.
@@ -64,7 +67,7 @@ def laid_out(seen: FloatImage, flow: FloatImage, spacing: float, far: np.float32
     blocks = height, width // WIDTH
     nearness = np.empty((*blocks, samples, WIDTH), np.uint16)
     shares, cells = np.empty(blocks, np.float32), np.empty((*blocks, samples, 4), np.int16)
-    told = np.float32(1 / unit), np.float32(spacing), far
+    told = np.float32(1 / unit), np.float32(spacing), far, np.float32(slack)
     on_threads(_lay_out, height, seen, flow, *told, nearness, shares, cells)
     return Layout(nearness, flow, shares, cells, np.float32(unit))
 
@@ -93,7 +96,7 @@ def _count(y, k, seen, flow, scale, spacing, samples, width):  # type: ignore[no
 
 
 @njit(**SHARED)
-def _lay_out(first, end, seen, flow, scale, spacing, far, nearness, shares, cells):  # type: ignore[no-untyped-def]
+def _lay_out(first, end, seen, flow, scale, spacing, far, slack, nearness, shares, cells):  # type: ignore[no-untyped-def]
     """Keep what each block sees at its own instants, and where it begins to read, how far."""
     _, samples, width = seen.shape
     flat, kept, half = seen.reshape(-1), nearness.reshape(-1), splat(np.float32(0.5))
@@ -109,8 +112,13 @@ def _lay_out(first, end, seen, flow, scale, spacing, far, nearness, shares, cell
                 w, back = whole(splat(scale) * w + half), splat(back_at(i, shares[y, k]))
                 store_whole(kept, at + i * WIDTH, w)
                 dx, dy = _displacement(ax, bx, w, back), _displacement(ay, by, w, back)
-                cells[y, k, i, 0], cells[y, k, i, 2] = _span(dx, far)
-                cells[y, k, i, 1], cells[y, k, i, 3] = _span(dy, far)
+                left, columns = _span(dx, far, slack)
+                top, rows = _span(dy, far, slack)
+                if columns > 2 or rows > 2:  # tents do not go on
+                    left, columns = _span(dx, far, np.float32(0))
+                    top, rows = _span(dy, far, np.float32(0))
+                cells[y, k, i, 0], cells[y, k, i, 1] = left, top
+                cells[y, k, i, 2], cells[y, k, i, 3] = columns, rows
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -132,13 +140,17 @@ def _within(lanes, least, most):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _span(lanes, far):  # type: ignore[no-untyped-def]
-    """Give the first offset that a block's displacements need, and how many."""
+def _span(lanes, far, slack):  # type: ignore[no-untyped-def]
+    """Give the first offset that a block's displacements need, and how many: two within slack."""
     low, high = least(lanes), greatest(lanes)
     first = np.intp(np.floor(min(max(low, -far), far)))
     if low < -far or high > far:
         return first, APART
-    return first, np.intp(np.floor(high)) - first + 2
+    last = np.intp(np.floor(high))
+    closer = np.intp(np.floor(low + slack))
+    if last > first and high < np.float32(closer + 1) + slack:
+        return closer, 2
+    return first, last - first + 2
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -40,6 +40,7 @@ FEW = 0.02  # share of them up to which the first guess tells which of them coun
 # what noise adds to them in brief
 SPACING, OWN_SPACING = 1.5, 0.5
 WIDER, OWN_WIDER = 2.0, 1.0
+SLACK = 0.4  # px, of a share that noise hides; `sweep_of`
 COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
 EARLIER = 2 / 3  # by how much noise may shorten all reweightings but the last
 CLEAN = 0.003  # sigma [stored units] up to which all steps are worth it
@@ -70,6 +71,7 @@ class Effort:
     sigma: float  # stored units
     steps: LatentSteps
     spacing: tuple[float, float]  # px of the longest blur and of a block's for an instant
+    slack: float  # px, `sweep.sweep_of`
     longer: float  # how much longer each reweighting is at half the size
     sizes: int  # how many below this one
 
@@ -122,7 +124,8 @@ def restore_coarse_to_fine(
     spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     length = blur_length(motion.by_rows, depth, camera)
     sizes = 1 + math.floor(math.log2(max(length / (SHOWN + SHOWN_LATER * haste), 1)))
-    effort = Effort(sigma, steps, spacing, COARSE_LONGER - haste, sizes)
+    slack = SLACK * (1 - worth)
+    effort = Effort(sigma, steps, spacing, slack, COARSE_LONGER - haste, sizes)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
 
@@ -139,7 +142,7 @@ def _restored(level: Level, motion: Motion, effort: Effort) -> FloatImage:
         half = _restored(scaled_level(level, width, height), motion, less)
         first = _magnified(half, camera)
     longest, own = effort.spacing
-    sweep = blur_operator(motion, level.depth, camera, longest).thinned(own)
+    sweep = blur_operator(motion, level.depth, camera, longest).thinned(own, effort.slack)
     return restored_light(level.image, sweep, camera.transfer, effort.sigma, steps, first=first)
 
 

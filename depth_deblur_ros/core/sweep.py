@@ -134,14 +134,17 @@ class Sweep:
         return told.nearness, told.flow, told.shares, told.cells, self.far, self.room
 
 
-def sweep_of(seen: FloatImage, flow: FloatImage, margin: int, spacing: float = 0.0) -> Sweep:
+def sweep_of(
+    seen: FloatImage, flow: FloatImage, margin: int, spacing: float = 0.0, slack: float = 0.0
+) -> Sweep:
     """
     Lay out A for inverse depth seen (H, N, W') and flow; no pixel reads beyond the margin.
 
     spacing: px of its own longest blur for which a block has an instant, of at most N; 0: all N.
+    slack: px that a block may read beyond a cell as if the cell went on.
     """
     far = np.float32(margin - 1)
-    return Sweep(laid_out(seen, flow, spacing, far), far, margin + GUARD)
+    return Sweep(laid_out(seen, flow, spacing, far, slack), far, margin + GUARD)
 
 
 @njit(cache=True, nogil=True)
