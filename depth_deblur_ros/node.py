@@ -16,6 +16,7 @@ import threading
 import time
 from typing import Any
 
+from depth_deblur_ros.compiling import tell_of_compiling
 from depth_deblur_ros.core.data import InputError
 from depth_deblur_ros.core.solver import deblur
 from depth_deblur_ros.frames import SolvedPair
@@ -306,6 +307,7 @@ def main(args: Sequence[str] | None = None, node_type: type[DeblurNode] = Deblur
     try:
         rclpy.init(args=args)
         node = node_type()
+        tell_of_compiling(node.get_logger().info)
         node.autostart()
         executor = SingleThreadedExecutor()
         executor.add_node(node)

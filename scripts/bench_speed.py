@@ -31,6 +31,7 @@ from typing import Any
 os.environ.setdefault('OMP_WAIT_POLICY', 'passive')  # spinning threads are no work
 
 from depth_deblur_ros.charts import chart, Curve, Panel
+from depth_deblur_ros.compiling import tell_of_compiling
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion, RgbdFrame
 from depth_deblur_ros.core.params import params_from_mapping, SolverParams
 from depth_deblur_ros.core.solver import deblur
@@ -178,6 +179,7 @@ def one_result(path: str) -> None:
     height, width = depth.shape
     focal = 0.82 * width
     camera = CameraIntrinsics(focal, focal, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    tell_of_compiling(lambda text: print(text, file=sys.stderr))  # as the command line does
     solve(RgbdFrame(image, depth, camera), 'full')
     # Not ru_maxrss: a process begins with that of whoever started it.
     status = Path('/proc/self/status').read_text().split()

@@ -4,8 +4,18 @@ import os
 from pathlib import Path
 import subprocess
 import sys
+from types import SimpleNamespace
 
+from depth_deblur_ros import compiling
+from depth_deblur_ros.core import descent, leaning
+from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome, RgbdFrame
+from depth_deblur_ros.core.joint import Effort, refine
+from depth_deblur_ros.core.solver import restore_known
+from depth_deblur_ros.core.start import Start
+import numpy as np
 import pytest
+
+HELPED = descent._descend, leaning._lean_rows
 
 SOURCE = """
 import sys
@@ -46,3 +56,52 @@ def test_the_first_run_says_so_and_the_second_finds_the_kernels_elsewhere(read_o
     assert first.count('compiling kernels') == 1
     assert str(read_only / 'cache') in first
     assert run(read_only) == ''
+
+
+def test_the_helper_compiles_what_a_frame_needs():
+    """Another kind of array would be compiled for nothing."""
+    rng = np.random.default_rng(0)
+    camera = CameraIntrinsics(64.0, 64.0, 31.5, 31.5, 96, 96)
+    frame = RgbdFrame(rng.random((96, 96, 3), np.float32), np.ones((96, 96), np.float32), camera)
+    turn = Motion(np.array([0.0, 0.05, 0.0]), np.zeros(3), covariance=1e-4 * np.eye(6))
+    restore_known(frame, turn)
+    start = Start(turn, Outcome.SOLVED, 1.0, spread=1e-4 * np.eye(9))
+    refine(frame.image[..., 0].copy(), frame.depth, camera, start, Effort(moves=1))
+    needed = [set(kernel.signatures) for kernel in HELPED]
+    compiling.main()
+    assert all(needed)
+    assert needed == [set(kernel.signatures) for kernel in HELPED]
+
+
+class Kernel:
+    """What numba tells of a kernel that it compiles."""
+
+    def __init__(self, module, cache):
+        self.py_func, self.stats = Kernel, SimpleNamespace(cache_path=cache)
+        self.py_func.__module__ = module
+
+
+@pytest.mark.parametrize(
+    ('module', 'cache', 'cores', 'said', 'called'),
+    [
+        ('depth_deblur_ros.core.light', '/cache', 2, 1, 1),
+        ('depth_deblur_ros.core.light', '/cache', 1, 1, 0),
+        ('depth_deblur_ros.core.light', None, 2, 1, 0),  # what it compiled would be lost
+        ('skimage.filters', '/cache', 2, 0, 0),
+    ],
+)
+def test_a_helper_is_called_once_where_it_is_of_use(
+    monkeypatch, module, cache, cores, said, called
+):
+    lines, calls = [], []
+    monkeypatch.setattr(compiling, '_call_helper', lambda: calls.append(1))
+    monkeypatch.setattr(compiling, 'cores', lambda: cores)
+    teller = compiling._Teller(lines.append)
+    for _ in range(2):
+        teller.on_start(SimpleNamespace(data={'dispatcher': Kernel(module, cache)}))
+    assert (len(lines), len(calls)) == (said, called)
+
+
+def test_without_a_helper_nothing_is_lost(monkeypatch):
+    monkeypatch.setattr(sys, 'executable', '/nothing/there')
+    compiling._call_helper()
