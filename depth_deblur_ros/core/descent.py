@@ -95,7 +95,7 @@ def _total(values):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _descend(board, leads, limit, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
     """Take pieces; who leads says what is next: the first direction, then step after step."""
-    kind, count, steps, left = np.int64(ADVANCE), 0, 0, 0.0
+    kind, count, steps, left = np.int64(ADVANCE), np.int64(0), 0, 0.0
     if leads:
         count = begin(board, kind, _rows(kind, planes, blurred))
     while True:

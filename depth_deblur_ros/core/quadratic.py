@@ -169,15 +169,16 @@ def _add_prior(y, counts, x, links, ease, sign, out, products, below):  # type: 
     r = g = b = none, none, none
     sums, signs = (none, none), splat(sign)
     less = plane if ease.size == plane else 0
+    zero = np.intp(0)  # for 0, a constant, what is called would be compiled once more
     for k in range(wide // WIDTH):
         place, here = (y, k * WIDTH, high, wide, less), y * wide + k * WIDTH
         for m in range(4):
             prefetch(links, m * plane + here + wide)
-        of_r, r = _pulls(0, place, x, links, ease, r, below)
-        of_g, g = _pulls(1, place, x, links, ease, g, below)
-        of_b, b = _pulls(2, place, x, links, ease, b, below)
+        of_r, r = _pulls(zero, place, x, links, ease, r, below)
+        of_g, g = _pulls(zero + 1, place, x, links, ease, g, below)
+        of_b, b = _pulls(zero + 2, place, x, links, ease, b, below)
         if counts:
-            sums = _added(here, signs * of_r, x, ease, 0, flat, sums)
+            sums = _added(here, signs * of_r, x, ease, zero, flat, sums)
             sums = _added(here + plane, signs * of_g, x, ease, less, flat, sums)
             sums = _added(here + 2 * plane, signs * of_b, x, ease, 2 * less, flat, sums)
     if counts:
@@ -193,17 +194,24 @@ def sum_rows(first, end, strips, rows, x, links, ease, sign, out, products):  # 
     products (h, 2) of each row: <x, out>, and <out, out> preconditioned.
     """
     _, high, wide = out.shape
-    count, _, depth, _ = strips.shape
     x, links, ease = x.reshape(-1), links.reshape(-1), ease.reshape(-1)
     begin, below = max(first, GUARD), np.zeros(3 * wide, np.float32)
-    _add_prior(begin - 1, False, x, links, ease, sign, out, products, below)
-    for y in range(begin, min(end, high - GUARD)):
-        for c in range(3):
-            for i in range(wide):
-                out[c, y, i] = 0
-            for k in range(count):
-                j = y - np.int64(k) * rows // count
-                if 0 <= j < depth:
-                    for i in range(wide):
-                        out[c, y, i] += strips[k, c, j, i]
-        _add_prior(y, True, x, links, ease, sign, out, products, below)
+    for y in range(begin - 1, min(end, high - GUARD)):
+        counts = y >= begin  # the row before says what it does to the first
+        if counts:
+            _add_strips(y, strips, rows, out)
+        _add_prior(y, counts, x, links, ease, sign, out, products, below)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _add_strips(y, strips, rows, out):  # type: ignore[no-untyped-def]
+    """Write what strips say of row y."""
+    count, _, depth, wide = strips.shape
+    for c in range(3):
+        for i in range(wide):
+            out[c, y, i] = 0
+        for k in range(count):
+            j = y - np.int64(k) * rows // count
+            if 0 <= j < depth:
+                for i in range(wide):
+                    out[c, y, i] += strips[k, c, j, i]

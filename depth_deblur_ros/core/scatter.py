@@ -104,7 +104,7 @@ def _scatter_row(y, first, strip, blurred, data, far, room, sizes):  # type: ign
         one, parts = data[2][y * (width // WIDTH) + k], flow_at(y, k, data[1], width)
         r, g, b = _shared(blurred, y * width + k * WIDTH, colour, splat(one))
         of_r = of_g = of_b = none
-        held = -1
+        held = np.intp(-1)  # a constant would have what is called compiled once more
         for i in range(samples):
             if back_at(i, one) < np.float32(-0.5):
                 break
