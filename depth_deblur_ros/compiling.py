@@ -8,8 +8,9 @@ is a second core, a helper begins with those that are needed last, and leaves th
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Callable
+from functools import cache
+import os
 import subprocess
 import sys
 from threading import Thread
@@ -24,6 +25,8 @@ from depth_deblur_ros.core.seen import pack
 from depth_deblur_ros.core.threads import cores
 from numba.core import event
 import numpy as np
+
+MODULE = 'depth_deblur_ros.compiling'
 
 
 class _Teller(event.Listener):
@@ -42,7 +45,7 @@ class _Teller(event.Listener):
                 f'{kept or "no cache, and compiles them again"}'
             )
             if kept and cores() > 1:
-                _call_helper()
+                call_helper()
 
     def on_end(self, event: Any) -> None:
         """Nothing to say."""
@@ -53,16 +56,43 @@ def tell_of_compiling(say: Callable[[str], None]) -> None:
     event.register('numba:compile', _Teller(say))  # type: ignore[no-untyped-call]
 
 
-def _call_helper() -> None:
-    """Let another process compile, no longer than this one lives; without it, all is done here."""
-    command = [sys.executable, '-P', '-m', 'depth_deblur_ros.compiling']
-    none = subprocess.DEVNULL
+@cache
+def call_helper() -> subprocess.Popen[bytes] | None:
+    """
+    Let another process compile, once, no longer than this one lives; give it.
+
+    None if it cannot be started: then all is compiled here.
+    """
+    path = os.pathsep.join(filter(None, sys.path))  # it must find the package that this one found
+    command, none = [sys.executable, '-P', '-m', MODULE], subprocess.DEVNULL
+    env = os.environ | {'PYTHONPATH': path}
     try:
-        helper = subprocess.Popen(command, stdin=none, stdout=none, stderr=none)
-    except OSError:
-        return
-    atexit.register(helper.kill)  # a kernel is kept whole or not at all
-    Thread(target=helper.wait, daemon=True).start()
+        helper = subprocess.Popen(
+            command, env=env, stdin=subprocess.PIPE, stdout=none, stderr=none
+        )
+        Thread(target=helper.wait, daemon=True).start()  # else it stays in the process table
+    except (OSError, RuntimeError, TypeError):
+        return None
+    return helper
+
+
+class _Leaver(event.Listener):
+    """Ends the helper before its next kernel when whoever called it is gone: none is half kept."""
+
+    def __init__(self) -> None:
+        self._alone = False
+        Thread(target=self._wait, daemon=True).start()
+
+    def _wait(self) -> None:
+        os.read(sys.stdin.fileno(), 1)  # nothing comes, but its end
+        self._alone = True
+
+    def on_start(self, event: Any) -> None:
+        if self._alone:
+            raise SystemExit
+
+    def on_end(self, event: Any) -> None:
+        """Go on."""
 
 
 def main() -> None:
@@ -70,14 +100,14 @@ def main() -> None:
     camera = CameraIntrinsics(64.0, 64.0, 31.5, 31.5, 64, 64)
     ray, motion = pack(Motion(np.zeros(3), np.zeros(3)), camera)
     blur = BlurOperator(ray, motion, np.ones((64, 64, 3), np.float32), 4)
-    latent, seen = (
-        np.zeros(s, np.float32) for s in (blur.sweep.latent_shape, blur.sweep.blurred_shape)
-    )
+    sweep = blur.sweep
+    latent, seen = (np.zeros(s, np.float32) for s in (sweep.latent_shape, sweep.blurred_shape))
     links = np.zeros((4, *latent.shape[1:]), np.float32)
-    problem = Quadratic(blur.sweep, seen, links, np.ones_like(latent))
+    problem = Quadratic(sweep, seen, links, np.ones_like(latent))
     conjugate_gradients(problem, latent, latent.copy(), 1)
-    lean(blur, blur.sweep, latent, seen, seen)
+    lean(blur, sweep, latent, seen, seen)
 
 
 if __name__ == '__main__':
+    event.register('numba:compile', _Leaver())  # type: ignore[no-untyped-call]
     main()

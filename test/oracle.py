@@ -127,6 +127,8 @@ def cells(dx, dy, slack):
     Its own, or that of its block of 16 columns if none of them lies farther beyond than slack.
     """
     found = np.floor(dx), np.floor(dy)
+    if slack == 0:
+        return found
     for y, left, i in np.ndindex(len(dx), dx.shape[1] // 16, dx.shape[2]):
         block = np.s_[y, 16 * left : 16 * left + 16, i]
         common = [np.floor(d[block].min()) for d in (dx, dy)]
@@ -134,7 +136,7 @@ def cells(dx, dy, slack):
             if np.floor(d.max()) > common[k]:
                 common[k] = np.floor(d.min() + slack)
         beyond = max((d[block] - c).max() - 1 for d, c in zip((dx, dy), common, strict=True))
-        if slack and beyond < slack:
+        if beyond < slack:
             for axis, own in zip(found, common, strict=True):
                 axis[block] = own
     return found

@@ -73,14 +73,6 @@ def test_the_helper_compiles_what_a_frame_needs():
     assert needed == [set(kernel.signatures) for kernel in HELPED]
 
 
-class Kernel:
-    """What numba tells of a kernel that it compiles."""
-
-    def __init__(self, module, cache):
-        self.py_func, self.stats = Kernel, SimpleNamespace(cache_path=cache)
-        self.py_func.__module__ = module
-
-
 @pytest.mark.parametrize(
     ('module', 'cache', 'cores', 'said', 'called'),
     [
@@ -90,18 +82,47 @@ class Kernel:
         ('skimage.filters', '/cache', 2, 0, 0),
     ],
 )
-def test_a_helper_is_called_once_where_it_is_of_use(
-    monkeypatch, module, cache, cores, said, called
-):
+def test_a_helper_is_called_where_it_is_of_use(monkeypatch, module, cache, cores, said, called):
     lines, calls = [], []
-    monkeypatch.setattr(compiling, '_call_helper', lambda: calls.append(1))
+    monkeypatch.setattr(compiling, 'call_helper', lambda: calls.append(1))
     monkeypatch.setattr(compiling, 'cores', lambda: cores)
     teller = compiling._Teller(lines.append)
+    kernel = SimpleNamespace(
+        py_func=SimpleNamespace(__module__=module), stats=SimpleNamespace(cache_path=cache)
+    )
     for _ in range(2):
-        teller.on_start(SimpleNamespace(data={'dispatcher': Kernel(module, cache)}))
+        teller.on_start(SimpleNamespace(data={'dispatcher': kernel}))
     assert (len(lines), len(calls)) == (said, called)
 
 
-def test_without_a_helper_nothing_is_lost(monkeypatch):
+@pytest.fixture
+def fresh_helper():
+    """Call it as if nobody had before, and let it end."""
+    compiling.call_helper.cache_clear()
+    yield compiling.call_helper
+    helper = compiling.call_helper()
+    compiling.call_helper.cache_clear()
+    if helper:
+        helper.stdin.close()
+        helper.wait(120)
+
+
+def test_a_helper_is_called_once_and_does_its_work(fresh_helper):
+    helper = fresh_helper()
+    assert fresh_helper() is helper
+    assert helper.wait(120) == 0
+
+
+def test_a_helper_that_is_left_alone_ends_before_its_next_kernel(
+    fresh_helper, monkeypatch, tmp_path
+):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
+    helper = fresh_helper()
+    helper.stdin.close()  # as when this process ends, however it ends
+    assert helper.wait(120) == 0
+    assert not list(tmp_path.rglob('*descend*.nbc'))
+
+
+def test_without_a_helper_nothing_is_lost(fresh_helper, monkeypatch):
     monkeypatch.setattr(sys, 'executable', '/nothing/there')
-    compiling._call_helper()
+    assert fresh_helper() is None

@@ -5,7 +5,7 @@ import itertools
 
 import cv2
 from depth_deblur_ros.core import latent
-from depth_deblur_ros.core.blur import blur_operator
+from depth_deblur_ros.core.blur import blur_operator, BlurOperator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.descent import conjugate_gradients
 from depth_deblur_ros.core.latent import (
@@ -250,6 +250,20 @@ def test_no_step_of_the_conjugate_gradients_raises_the_quadratic(quadratic):
     assert values[10] < 0.2 * values[0]
 
 
+def test_the_slope_that_is_left_is_that_of_the_image_that_is_given():
+    """The next reweighting begins with it."""
+    _, taken, blur = blurred_cards('srgb', sigma=0.01)
+    sweep, stored = blur.sweep, blur.sweep.blurred_planes(taken)
+    light, trust = light_from_stored(stored, 'srgb'), 1 / np.square(light_slope(stored, 'srgb'))
+    first = sweep.widened(light)
+    problem = reweighted(first, sweep, 'srgb', trust, WEIGHT)
+    slope = problem.slope(sweep.missing(light, first), first)
+    begun = np.abs(slope).max()
+    image = conjugate_gradients(problem, first.copy(), slope, 5)
+    expected = problem.slope(sweep.missing(light, image), image)
+    np.testing.assert_allclose(slope, expected, atol=1e-5 * begun)
+
+
 def test_many_steps_reach_the_minimum_of_the_quadratic(quadratic):
     """There the slope of the quadratic along any direction is nothing beside what it was."""
     first, value, after = quadratic
@@ -287,6 +301,24 @@ def test_the_restored_picture_is_closer_to_the_sharp_one(transfer, sigma):
     found = restored(taken, blur, transfer, sigma, STEPS)
     assert 0 <= found.min() <= found.max() <= 1
     assert rms(found - sharp) < 0.5 * rms(taken - sharp)
+
+
+@pytest.mark.parametrize(
+    ('transfer', 'sigma', 'slack'), [('linear', 0, 0), ('srgb', 0, 0.2), ('linear', 0.02, 0.2)]
+)
+def test_blocks_have_slack_where_noise_hides_it(monkeypatch, transfer, sigma, slack):
+    """Where none is found, sRGB is taken to hide some."""
+    taken, told, thinned = blurred_cards(transfer, sigma)[1], [], BlurOperator.thinned
+
+    def spied(blur, spacing, slack):
+        told.append(slack)
+        return thinned(blur, spacing, slack)
+
+    monkeypatch.setattr(BlurOperator, 'thinned', spied)
+    camera = replace(CAMERA, transfer=transfer)
+    restore_coarse_to_fine(taken, DEPTH, SIDEWAYS, camera, STEPS)
+    assert told
+    assert told == pytest.approx([slack] * len(told))
 
 
 @pytest.mark.parametrize(('transfer', 'fewer'), [('srgb', True), ('linear', False)])

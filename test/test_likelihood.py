@@ -130,6 +130,22 @@ def test_the_adjoint_of_the_test_is_the_operator(converged):
     np.testing.assert_allclose(a @ planes[0].ravel(), matrix @ inner, atol=1e-4)
 
 
+def test_the_posterior_is_that_of_slopes_that_are_asked_anew():
+    """It exchanges the prior's part of the slope, and of the noise, with each reweighting."""
+    own, p = part(TINY, 0.5 * TRUTH), np.pad(0.5 * TRUTH, (0, 3))
+    _, sweep, latent = likelihood._unblurred(own, p)
+    data, trust = likelihood._observed(own, sweep)
+    for k in reversed(range(likelihood.REWEIGHTINGS)):
+        problem = likelihood._weighted(own, sweep, trust, latent)
+        push = problem.slope(sweep.missing(data, latent), latent)
+        push[1:] += own.scales.sigma * likelihood._prior_noise(problem, own.seed)
+        steps = own.pace.steps if k else own.pace.last
+        latent = likelihood.conjugate_gradients(problem, latent, push, steps)
+    found = posterior(own, p).latent
+    assert np.abs(found[1:]).max() > 0.01
+    np.testing.assert_allclose(found, latent, atol=1e-4)
+
+
 def test_sums_over_links_are_those_of_the_matrix():
     """x' R x by rows, and noise whose covariance is R."""
     found = posterior(part(TINY, 0.5 * TRUTH), np.pad(0.5 * TRUTH, (0, 3)))

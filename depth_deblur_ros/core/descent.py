@@ -29,7 +29,7 @@ def conjugate_gradients(
     """
     Solve from latent by `limit` steps; slope: minus the gradient.
 
-    Both are written over, and latent is given back.
+    Both are written over: latent is given back, and slope is left as minus the gradient there.
     """
     sweep, rows = problem.sweep, latent.shape[1]
     d, q = sweep.directions
@@ -95,6 +95,7 @@ def _total(values):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _descend(board, leads, limit, planes, blurred, parts, sums):  # type: ignore[no-untyped-def]
     """Take pieces; who leads says what is next: the first direction, then step after step."""
+    # For 0, a constant, what is called would be compiled once more.
     kind, count, steps, left = np.int64(ADVANCE), np.int64(0), 0, 0.0
     if leads:
         count = begin(board, kind, _rows(kind, planes, blurred))

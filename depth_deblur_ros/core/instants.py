@@ -114,7 +114,7 @@ def _lay_out(first, end, seen, flow, scale, spacing, far, slack, nearness, share
                 dx, dy = _displacement(ax, bx, w, back), _displacement(ay, by, w, back)
                 left, columns = _span(dx, far, slack)
                 top, rows = _span(dy, far, slack)
-                if columns > 2 or rows > 2:  # tents do not go on
+                if columns > 2 or rows > 2:  # tents end where a cell does
                     left, columns = _span(dx, far, np.float32(0))
                     top, rows = _span(dy, far, np.float32(0))
                 cells[y, k, i, 0], cells[y, k, i, 1] = left, top

@@ -40,7 +40,7 @@ FEW = 0.02  # share of them up to which the first guess tells which of them coun
 # what noise adds to them in brief
 SPACING, OWN_SPACING = 1.5, 0.5
 WIDER, OWN_WIDER = 2.0, 1.0
-SLACK = 0.4  # px, of a share that noise hides; `sweep_of`
+SLACK = 0.2  # px beyond a cell that a block may read, as far as noise hides it; `sweep_of`
 COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
 EARLIER = 2 / 3  # by how much noise may shorten all reweightings but the last
 CLEAN = 0.003  # sigma [stored units] up to which all steps are worth it
@@ -124,7 +124,7 @@ def restore_coarse_to_fine(
     spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     length = blur_length(motion.by_rows, depth, camera)
     sizes = 1 + math.floor(math.log2(max(length / (SHOWN + SHOWN_LATER * haste), 1)))
-    slack = SLACK * (1 - worth)
+    slack = SLACK * min(1.0, 2 * (1 - worth))
     effort = Effort(sigma, steps, spacing, slack, COARSE_LONGER - haste, sizes)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
@@ -178,15 +178,15 @@ def restored_light(
     light = light_from_stored(stored, transfer)
     full, noise = stored >= SATURATED, light_ease(stored, transfer)
     noise[:, :, width:] = 0
-    saturated = np.count_nonzero(full) / full.size
+    burnt = np.count_nonzero(full) / blurred.size
     start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for k in range(steps.outer):
-        if k == 0 or saturated > FEW:
+        if k == 0 or burnt > FEW:
             missing = sweep.missing(light, latent, sweep.taken)
             # What is saturated says only "at least this": drop it where the model gives more.
-            trust = np.where(full & (missing <= 0), np.float32(0), noise) if saturated else noise
+            trust = np.where(full & (missing <= 0), np.float32(0), noise) if burnt else noise
             problem = reweighted(latent, sweep, transfer, trust, weight)
             slope = problem.slope(missing, latent)
         else:

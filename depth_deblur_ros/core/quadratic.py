@@ -49,19 +49,20 @@ class Quadratic:
     def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
         """Give minus the gradient at a latent image; missing = B - A latent."""
         strips = self.sweep.scatter(np.multiply(self.trust, missing, out=self.sweep.taken))
-        return self._added(-1, latent, strips, np.zeros_like(latent))
+        return self._with_prior(-1, latent, strips, np.zeros_like(latent))
 
     def slope_after(self, before: Quadratic, slope: FloatImage, latent: FloatImage) -> FloatImage:
         """
-        Give minus the gradient from that (3, h, w) with the weights before; it is written over.
+        Give minus the gradient at latent from that of the problem before, which is written over.
 
-        Trust must be the same: then only what the prior adds is another, and nothing is blurred.
+        Both have the same sweep, whose `directions` are used, and trust; slope, latent (3, h, w).
         """
         _, room = self.sweep.directions
-        without = before._added(1, latent, slope[None], room)
-        return self._added(-1, latent, without[None], slope)
+        # One strip of all rows, to which the prior's part is added.
+        without = before._with_prior(1, latent, slope[None], room)
+        return self._with_prior(-1, latent, without[None], slope)
 
-    def _added(
+    def _with_prior(
         self, sign: int, latent: FloatImage, strips: FloatImage, out: FloatImage
     ) -> FloatImage:
         """Write strips of A' and sign times the prior's part of a latent image into out."""

@@ -79,7 +79,7 @@ def _choose(step, qs, best, found):  # type: ignore[no-untyped-def]
 def _shrink(board, leads, steps, qs, best, told):  # type: ignore[no-untyped-def]
     """Take pieces of what is to be judged; who leads chooses, and says what to try next."""
     q, matches, weights, flows, tables, shares, costs, found = told
-    rounds, count = 0, np.int64(0)
+    rounds, count = 0, np.int64(0)  # for 0, a constant, `all_done` would be compiled once more
     while True:
         kind, piece, of = take(board)
         if kind >= 0:

@@ -8,9 +8,9 @@ are (3, H, W').
 At one instant the pixels of a block read places that lie side by side, too, but for a slow drift
 and for edges in depth. So a block reads the same few offsets for all its pixels: 2 x 2 of them
 where all displacements fall into one cell, with bilinear weights; some more where they straddle a
-cell's border, weighted by tents, which comes to the same; pixel by pixel beyond MANY. In
-a thinned sweep blocks with a shorter blur have fewer instants (instants.py). What is gathered here
-is spread again in scatter.py.
+cell's border, weighted by tents, which comes to the same; pixel by pixel beyond MANY. Where slack
+is allowed, a cell may go on a little beyond its border instead. In a thinned sweep blocks with a
+shorter blur have fewer instants (instants.py). What is gathered here scatter.py spreads again.
 """
 
 from __future__ import annotations
