@@ -95,16 +95,21 @@ def test_a_helper_is_called_where_it_is_of_use(monkeypatch, module, cache, cores
     assert (len(lines), len(calls)) == (said, called)
 
 
-@pytest.fixture
-def fresh_helper():
-    """Call it as if nobody had before, and let it end."""
-    compiling.call_helper.cache_clear()
-    yield compiling.call_helper
-    helper = compiling.call_helper()
+def forget_helper():
+    """Let the helper end, if there is one, and the next be another."""
+    helper = compiling.call_helper() if compiling.call_helper.cache_info().currsize else None
     compiling.call_helper.cache_clear()
     if helper:
         helper.stdin.close()
         helper.wait(120)
+
+
+@pytest.fixture
+def fresh_helper():
+    """Call it as if nobody had before."""
+    forget_helper()
+    yield compiling.call_helper
+    forget_helper()
 
 
 def test_a_helper_is_called_once_and_does_its_work(fresh_helper):
