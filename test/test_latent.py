@@ -9,6 +9,7 @@ from depth_deblur_ros.core.blur import blur_operator, BlurOperator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion
 from depth_deblur_ros.core.descent import conjugate_gradients
 from depth_deblur_ros.core.latent import (
+    _trust_rows,
     FEW,
     LatentSteps,
     noise_sigma,
@@ -68,7 +69,7 @@ def restored(taken, blur, transfer, sigma, steps):
 
 
 def links_of(stored):
-    links = np.zeros((4, *stored.shape[1:]), np.float32)
+    links = np.full((4, *stored.shape[1:]), 9, np.float32)  # the last image's
     _link_weights(0, stored.shape[1], stored, WEIGHT, links)
     return links
 
@@ -211,7 +212,7 @@ def quadratic():
         return 0.5 * data + oracle.prior_energy(inside(x).astype(np.float64), links, scale)
 
     def after(limit):
-        slope = problem.slope(sweep.missing(light, first), first)
+        slope = problem.slope(trust * sweep.missing(light, first), first)
         return conjugate_gradients(problem, first.copy(), slope, limit)
 
     return first, value, after
@@ -225,11 +226,26 @@ def test_a_slope_is_the_same_when_only_the_prior_of_another_is_exchanged():
     trust = 0.5 + rng.random(sweep.blurred_shape, np.float32)
     first, latent = (sweep.widened(k * planes + 0.1) for k in (0.5, 0.8))
     before, problem = (reweighted(x, sweep, 'srgb', trust, 300 * WEIGHT) for x in (first, latent))
-    missing = sweep.missing(light, latent)
-    expected = problem.slope(missing, latent)
-    found = problem.slope_after(before, before.slope(missing, latent), latent)
+    pull = trust * sweep.missing(light, latent)
+    expected = problem.slope(pull, latent)
+    found = problem.slope_after(before, before.slope(pull, latent), latent)
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
-    assert np.abs(before.slope(missing, latent) - expected).max() > 0.01 * np.abs(expected).max()
+    assert np.abs(before.slope(pull, latent) - expected).max() > 0.01 * np.abs(expected).max()
+
+
+@given(seed=seeds)
+@few
+def test_what_is_saturated_counts_where_the_model_gives_less(seed):
+    rng = np.random.default_rng(seed)
+    missing, noise = (
+        rng.standard_normal((3, 5, 16), np.float32),
+        rng.random((3, 5, 16), np.float32),
+    )
+    full, trust, pull = rng.random(missing.shape) < 0.3, noise.copy(), missing.copy()
+    _trust_rows(0, 2, full, trust, pull)
+    _trust_rows(2, 5, full, trust, pull)
+    np.testing.assert_array_equal(trust, np.where(full & (missing <= 0), np.float32(0), noise))
+    np.testing.assert_array_equal(pull, trust * missing)
 
 
 @pytest.mark.parametrize('share', [0.01, 0.05])
@@ -257,10 +273,10 @@ def test_the_slope_that_is_left_is_that_of_the_image_that_is_given():
     light, trust = light_from_stored(stored, 'srgb'), 1 / np.square(light_slope(stored, 'srgb'))
     first = sweep.widened(light)
     problem = reweighted(first, sweep, 'srgb', trust, WEIGHT)
-    slope = problem.slope(sweep.missing(light, first), first)
+    slope = problem.slope(trust * sweep.missing(light, first), first)
     begun = np.abs(slope).max()
     image = conjugate_gradients(problem, first.copy(), slope, 5)
-    expected = problem.slope(sweep.missing(light, image), image)
+    expected = problem.slope(trust * sweep.missing(light, image), image)
     np.testing.assert_allclose(slope, expected, atol=1e-5 * begun)
 
 
@@ -319,6 +335,27 @@ def test_blocks_have_slack_where_noise_hides_it(monkeypatch, transfer, sigma, sl
     restore_coarse_to_fine(taken, DEPTH, SIDEWAYS, camera, STEPS)
     assert told
     assert told == pytest.approx([slack] * len(told))
+
+
+@pytest.mark.parametrize('brief', [False, True])
+def test_long_blurs_have_wider_instants_in_brief_where_there_is_noise(monkeypatch, brief):
+    """As many at half the size; 10 px are no long blur."""
+    told, operator = [], latent.blur_operator
+
+    def spied(motion, depth, camera, spacing):
+        told.append(spacing)
+        return operator(motion, depth, camera, spacing)
+
+    monkeypatch.setattr(latent, 'blur_operator', spied)
+    camera = CameraIntrinsics(128.0, 128.0, 63.5, 47.5, 128, 96)
+    depth, taken = np.full((96, 128), 2, np.float32), cards(0, (96, 128))
+    for length in (10, 40):
+        motion = Motion(np.zeros(3), [length / 64, 0, 0])
+        restore_coarse_to_fine(taken, depth, motion, camera, replace(STEPS, brief=brief))
+    half, usual, coarse, long = told
+    assert half == usual
+    assert (long > usual) == brief
+    assert coarse == pytest.approx(max(long / 2, usual))
 
 
 @pytest.mark.parametrize(('transfer', 'fewer'), [('srgb', True), ('linear', False)])

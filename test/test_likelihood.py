@@ -137,7 +137,7 @@ def test_the_posterior_is_that_of_slopes_that_are_asked_anew():
     data, trust = likelihood._observed(own, sweep)
     for k in reversed(range(likelihood.REWEIGHTINGS)):
         problem = likelihood._weighted(own, sweep, trust, latent)
-        push = problem.slope(sweep.missing(data, latent), latent)
+        push = problem.slope(trust * sweep.missing(data, latent), latent)
         push[1:] += own.scales.sigma * likelihood._prior_noise(problem, own.seed)
         steps = own.pace.steps if k else own.pace.last
         latent = likelihood.conjugate_gradients(problem, latent, push, steps)
@@ -151,7 +151,7 @@ def test_sums_over_links_are_those_of_the_matrix():
     found = posterior(part(TINY, 0.5 * TRUTH), np.pad(0.5 * TRUTH, (0, 3)))
     problem, rng = found.problem, np.random.default_rng(0)
     x = found.latent + rng.standard_normal(found.latent.shape, np.float32)
-    none = np.zeros_like(problem.trust)
+    none = np.zeros(problem.sweep.blurred_shape, np.float32)
     expected = [
         -float(np.vdot(plane, r)) for plane, r in zip(x, problem.slope(none, x), strict=True)
     ]

@@ -8,7 +8,7 @@ from depth_deblur_ros.core.blur import blur_operator
 from depth_deblur_ros.core.data import CameraIntrinsics, Motion, Outcome
 from depth_deblur_ros.core.evidence import motion_axes
 from depth_deblur_ros.core.geometry import blur_length, flow
-from depth_deblur_ros.core.start import blind_start
+from depth_deblur_ros.core.trust import edges_of
 import numpy as np
 from pictures import swept, texture
 import pytest
@@ -17,6 +17,11 @@ from speed_frames import blurred_frame
 CAMERA = CameraIntrinsics(262.0, 262.0, 159.5, 119.5, 320, 240)
 DEPTH = np.full((240, 320), 2, np.float32)
 AXES = motion_axes(DEPTH, CAMERA)[:6, :6]
+
+
+def blind_start(grey, *told):
+    """Give the start of a grey picture."""
+    return start.blind_start(edges_of(grey), *told)
 
 
 def sideways(length, angle):

@@ -1,6 +1,7 @@
 """Work on several threads: the same on any number of them, from anywhere; at rest afterwards."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 import subprocess
 import sys
 import threading
@@ -110,6 +111,24 @@ def test_what_a_share_asks_for_its_own_thread_does(both):
     assert sorted(inside) == sorted(callers)
     np.testing.assert_allclose(values, [ROOTS, ROOTS], rtol=1e-12)
     on_threads(lambda *_: both.wait(), 2)  # and shares again afterwards
+
+
+def test_two_functions_run_side_by_side_and_each_has_its_answer(both):
+    def at_its_end(answer):
+        both.wait()  # nobody gets on alone
+        return answer
+
+    assert threads.both(lambda: at_its_end(1), lambda: at_its_end('two')) == (1, 'two')
+
+
+@pytest.mark.parametrize('number', [1, 2])
+def test_of_two_functions_the_first_runs_here_and_none_twice(use, number):
+    use(number)
+    calls = []
+    for k in range(100):
+        where, _ = threads.both(threading.get_ident, partial(calls.append, k))
+        assert where == threading.get_ident()
+    assert calls == list(range(100))
 
 
 def test_many_may_ask_at_once(use):

@@ -5,7 +5,7 @@ from depth_deblur_ros.core.data import Motion
 from depth_deblur_ros.core.trust import (
     calibrated,
     covariance_from_curvature,
-    Edges,
+    edges_of,
     LEAST_ERROR,
     sharpness,
 )
@@ -40,10 +40,10 @@ def test_what_is_blurred_somewhere_is_not_evenly_sharp():
     partly, plain = grey.copy(), grey.copy()
     partly[: height // 2, : width // 2] = swept(grey, 24)[: height // 2, : width // 2]
     plain[: height // 2, : width // 2] = 0.5
-    assert Edges(grey).evenly > 1.1
-    assert Edges(partly).along > 1.1
-    assert Edges(partly).evenly < 1.045
-    assert Edges(plain).evenly > 1.1  # a quarter without edges tells nothing
+    assert edges_of(grey).evenly > 1.1
+    assert edges_of(partly).along > 1.1
+    assert edges_of(partly).evenly < 1.045
+    assert edges_of(plain).evenly > 1.1  # a quarter without edges tells nothing
 
 
 def test_noise_is_sharp():

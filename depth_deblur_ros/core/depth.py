@@ -18,7 +18,9 @@ Weight of a seed, docs/method.md:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
+from typing import Any
 
 import cv2
 from depth_deblur_ros.core.data import FloatImage, InputError
@@ -45,18 +47,36 @@ def fill_depth(depth: FloatImage, guide: FloatImage, *, threads: int) -> FloatIm
     NaN, zero, negative and infinite values are holes. guide (H, W) or (H, W, 3), finite, 0..1, may
     be blurred by motion. What is filled in lies between the depths around it.
     """
+    with at_most(threads):
+        return find_holes(depth, guide).filled()
+
+
+@dataclass(frozen=True, eq=False)
+class Holes:
+    """Depth (H, W) [m], 0 where it is not measured, and what its holes are filled with."""
+
+    depth: FloatImage
+    measured: npt.NDArray[np.bool_]
+    seeds: tuple[Any, ...]  # colours (H, W, C) and what `find_seeds` gives; none without holes
+
+    def filled(self) -> FloatImage:
+        """Fill them, in place."""
+        if self.seeds:
+            on_threads(_fill, len(self.depth), self.depth, self.measured, *self.seeds)
+        return self.depth
+
+
+def find_holes(depth: FloatImage, guide: FloatImage) -> Holes:
+    """Look what `fill_depth` will need; hardly more than one thread is used for it."""
     _check(depth, guide)
     measured = (depth > 0) & (depth < np.inf)
     if measured.all():
-        return depth.copy()
+        return Holes(depth.copy(), measured, ())
     if not measured.any():
         raise InputError('depth has no measured pixel: 100 % of it are holes')
-    filled = np.where(measured, depth, np.float32(0))
+    known = np.where(measured, depth, np.float32(0))
     colours = np.ascontiguousarray(guide).reshape(*depth.shape, -1)
-    with at_most(threads):
-        seeds = find_seeds(filled, measured, colours)
-        on_threads(_fill, len(filled), filled, measured, colours, *seeds)
-    return filled
+    return Holes(known, measured, (colours, *find_seeds(known, measured, colours)))
 
 
 def find_seeds(

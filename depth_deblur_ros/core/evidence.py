@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
 from depth_deblur_ros.core.geometry import interaction_matrix, rows_matrix
 from depth_deblur_ros.core.spectra import patch_spectra
@@ -126,8 +127,8 @@ def motion_axes(depth: FloatImage, camera: CameraIntrinsics) -> Vector:
     depth's spread moves 1 px. By rows: shifts and roll that are 1 px more in the last row than in
     the first.
     """
-    w = 1 / depth.astype(np.float64)
-    mean, spread = float(w.mean()), max(float(w.std()), 0.02 * float(w.mean()))
+    mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(1 / depth))
+    spread = max(spread, 0.02 * mean)
     corner = 0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy)
     g = np.zeros((9, 9))
     g[1, 0], g[0, 1] = 1 / camera.fx, -1 / camera.fy

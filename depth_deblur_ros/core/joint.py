@@ -13,7 +13,7 @@ covariance.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 import math
 
@@ -50,10 +50,12 @@ class Effort:
     enough: float = 0.15  # px; the first shorter move is the last
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
     doubt: float = 1.0  # times as large is the covariance as that of a refinement to the end
+    instants: float = math.inf  # over the mean blur, at most: noise hides finer ones
     pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
-        more = all(value > 0 for value in (self.enough, self.readable, self.doubt))
+        shares = self.enough, self.readable, self.doubt, self.instants
+        more = all(value > 0 for value in shares)
         if self.pixels < 1 or self.moves < 1 or not more:
             raise InputError(f'pixels, moves must be >= 1, the rest > 0, not {self}')
 
@@ -85,8 +87,10 @@ def refine(
 
     p, certainty = start.motion.by_rows, np.asarray(np.linalg.inv(start.spread), np.float64)
     level, pixels = _readable(Level(light, depth, camera), length(p), effort)
+    spacing = blur_length(p, level.depth, level.camera) / effort.instants
+    pace = replace(effort.pace, spacing=max(effort.pace.spacing, spacing))
     # Side by side: they are too small for two threads to share one.
-    begun = each(lambda k: _begun(_part(level, k, pixels, effort.pace), p), range(4))
+    begun = each(lambda k: _begun(_part(level, k, pixels, pace), p), range(4))
     pull = Pull(p, certainty, DISSENT[camera.transfer])
     return _moved(begun, pull, length, effort)
 

@@ -28,7 +28,8 @@ from depth_deblur_ros.core.light import light_ease, light_from_stored, stored_fr
 from depth_deblur_ros.core.pyramid import Level, scaled_level
 from depth_deblur_ros.core.quadratic import reweighted
 from depth_deblur_ros.core.sweep import Sweep
-from depth_deblur_ros.core.threads import each
+from depth_deblur_ros.core.threads import each, on_threads, SHARED
+from numba import njit
 import numpy as np
 
 # px of mean blur for which half of a size is worth it (of the full one it always is), and what
@@ -40,6 +41,7 @@ FEW = 0.02  # share of them up to which the first guess tells which of them coun
 # what noise adds to them in brief
 SPACING, OWN_SPACING = 1.5, 0.5
 WIDER, OWN_WIDER = 2.0, 1.0
+OF_LONG = 1 / 3  # what noise adds to them over long blurs, in brief: a share of the mean blur
 SLACK = 0.2  # px beyond a cell that a block may read, as far as noise hides it; `sweep_of`
 COARSE_OUTER, COARSE_LONGER = 2, 1.5  # reweightings at half the size, and how much longer each
 EARLIER = 2 / 3  # by how much noise may shorten all reweightings but the last
@@ -71,6 +73,7 @@ class Effort:
     sigma: float  # stored units
     steps: LatentSteps
     spacing: tuple[float, float]  # px of the longest blur and of a block's for an instant
+    long: float  # px from one instant to the next, at least
     slack: float  # px, `sweep.sweep_of`
     longer: float  # how much longer each reweighting is at half the size
     sizes: int  # how many below this one
@@ -121,11 +124,12 @@ def restore_coarse_to_fine(
     worth = math.sqrt(CLEAN / max(CLEAN, sigma, SIGMA_FLOOR[camera.transfer]))
     haste = 1 - worth if steps.brief else 0.0
     steps = replace(steps, inner=math.ceil(worth * steps.inner), early=1 - EARLIER * haste)
-    spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     length = blur_length(motion.by_rows, depth, camera)
+    spacing = (SPACING + WIDER * haste, OWN_SPACING + OWN_WIDER * haste)
     sizes = 1 + math.floor(math.log2(max(length / (SHOWN + SHOWN_LATER * haste), 1)))
     slack = SLACK * min(1.0, 2 * (1 - worth))
-    effort = Effort(sigma, steps, spacing, slack, COARSE_LONGER - haste, sizes)
+    long = OF_LONG * haste * length
+    effort = Effort(sigma, steps, spacing, long, slack, COARSE_LONGER - haste, sizes)
     light = _restored(Level(blurred, depth, camera), motion, effort)
     return stored_from_light(light, camera.transfer)
 
@@ -138,10 +142,16 @@ def _restored(level: Level, motion: Motion, effort: Effort) -> FloatImage:
         inner = round(effort.longer * steps.inner)
         coarse = replace(steps, outer=COARSE_OUTER, inner=inner)
         # Four pixels in one: half the noise.
-        less = replace(effort, sigma=effort.sigma / 2, steps=coarse, sizes=effort.sizes - 1)
+        less = replace(
+            effort,
+            sigma=effort.sigma / 2,
+            steps=coarse,
+            long=effort.long / 2,
+            sizes=effort.sizes - 1,
+        )
         half = _restored(scaled_level(level, width, height), motion, less)
         first = _magnified(half, camera)
-    longest, own = effort.spacing
+    longest, own = max(effort.spacing[0], effort.long), effort.spacing[1]
     sweep = blur_operator(motion, level.depth, camera, longest).thinned(own, effort.slack)
     return restored_light(level.image, sweep, camera.transfer, effort.sigma, steps, first=first)
 
@@ -175,23 +185,39 @@ def restored_light(
     """
     height, width = blurred.shape[:2]
     stored = sweep.blurred_planes(blurred)
-    light = light_from_stored(stored, transfer)
-    full, noise = stored >= SATURATED, light_ease(stored, transfer)
+    light, noise = light_from_stored(stored, transfer), light_ease(stored, transfer)
     noise[:, :, width:] = 0
-    burnt = np.count_nonzero(full) / blurred.size
+    full = stored >= SATURATED
+    many = np.count_nonzero(full) > FEW * blurred.size
     start = light[:, :, :width] if first is None else np.moveaxis(first, 2, 0)
     latent = sweep.widened(start)
     weight = np.float32(steps.prior * max(sigma, SIGMA_FLOOR[transfer]) ** 2)
     for k in range(steps.outer):
-        if k == 0 or burnt > FEW:
-            missing = sweep.missing(light, latent, sweep.taken)
-            # What is saturated says only "at least this": drop it where the model gives more.
-            trust = np.where(full & (missing <= 0), np.float32(0), noise) if burnt else noise
+        if k == 0 or many:
+            pull = sweep.missing(light, latent, sweep.taken)
+            trust = noise.copy() if many else noise
+            on_threads(_trust_rows, height, full, trust, pull)
             problem = reweighted(latent, sweep, transfer, trust, weight)
-            slope = problem.slope(missing, latent)
+            slope = problem.slope(pull, latent)
         else:
             before, problem = problem, reweighted(latent, sweep, transfer, trust, weight)
             slope = problem.slope_after(before, slope, latent)
         latent = conjugate_gradients(problem, latent, slope, steps.within(k))
     r = sweep.room
     return np.asarray(cv2.merge([*latent[:, r : r + height, r : r + width]]), np.float32)
+
+
+@njit(**SHARED)
+def _trust_rows(first, end, full, trust, missing):  # type: ignore[no-untyped-def]
+    """
+    Take trust from what is full and of what is not missing, B - A L; leave their product there.
+
+    What is saturated says only "at least this": it does not count where the model gives more.
+    """
+    for c in range(3):
+        for y in range(first, end):
+            for x in range(trust.shape[2]):
+                counts = not full[c, y, x] or missing[c, y, x] > 0
+                own = trust[c, y, x] if counts else np.float32(0)
+                trust[c, y, x] = own
+                missing[c, y, x] *= own

@@ -110,7 +110,7 @@ def settled(part: Part, p: Vector) -> Posterior:
     for k in reversed(range(REWEIGHTINGS)):
         sigma, steps = part.scales.sigma, part.pace.steps if k else part.pace.last
         problem = _weighted(part, sweep, trust, latent)
-        push = problem.slope(missing, latent)
+        push = problem.slope(trust * missing, latent)
         push[1:] += sigma * _prior_noise(problem, part.seed)
         latent = conjugate_gradients(problem, latent, push, steps)
         if k:
@@ -129,7 +129,7 @@ def posterior(part: Part, p: Vector) -> Posterior:
     blur, sweep, latent = _unblurred(part, p)
     data, trust = _observed(part, sweep)
     problem = _weighted(part, sweep, trust, latent)
-    push = problem.slope(sweep.missing(data, latent, sweep.taken), latent)
+    push = problem.slope(trust * sweep.missing(data, latent, sweep.taken), latent)
     noise = part.scales.sigma * _prior_noise(problem, part.seed)
     push[1:] += noise
     for k in reversed(range(REWEIGHTINGS)):

@@ -46,10 +46,9 @@ class Quadratic:
     links: FloatImage  # (4, h, w) weights to the neighbours right, below, below right, below left
     ease: FloatImage  # (1 or 3, h, w) 1 / l'^2
 
-    def slope(self, missing: FloatImage, latent: FloatImage) -> FloatImage:
-        """Give minus the gradient at a latent image; missing = B - A latent."""
-        strips = self.sweep.scatter(np.multiply(self.trust, missing, out=self.sweep.taken))
-        return self._with_prior(-1, latent, strips, np.zeros_like(latent))
+    def slope(self, pull: FloatImage, latent: FloatImage) -> FloatImage:
+        """Give minus the gradient at a latent image; pull (3, H, W') = trust (B - A latent)."""
+        return self._with_prior(-1, latent, self.sweep.scatter(pull), np.zeros_like(latent))
 
     def slope_after(self, before: Quadratic, slope: FloatImage, latent: FloatImage) -> FloatImage:
         """
@@ -78,7 +77,7 @@ def reweighted(
 ) -> Quadratic:
     """Put the weights of (7) at the present image, light in latent planes (1 or 3, h, w)."""
     stored, ease = stored_and_ease(light, transfer)
-    links = np.zeros((4, *stored.shape[1:]), np.float32)
+    links = np.empty((4, *stored.shape[1:]), np.float32)
     on_threads(_link_weights, stored.shape[1], stored, weight, links)
     return Quadratic(sweep, trust, links, ease)
 
@@ -97,11 +96,13 @@ def _link_weights(first, end, stored, weight, links):  # type: ignore[no-untyped
     planes, height, width = stored.shape
     flat, mean = stored.reshape(-1), np.empty(width, np.float32)
     share, floor = np.float32(1 / planes), np.float32(EPSILON * EPSILON)
-    for y in range(max(first, GUARD), min(end, height - GUARD)):
+    for y in range(first, end):
         for k in range(4):
-            down, aside = min(k, 1), (1, 0, 1, -1)[k]
+            row, down, aside = links[k, y], min(k, 1), (1, 0, 1, -1)[k]
             left, right = np.uintp(max(-aside, 0)), np.uintp(width - max(aside, 0))
-            if down and y == height - GUARD - 1:
+            for x in range(width):
+                row[x] = 0
+            if not GUARD <= y < height - GUARD - down:
                 continue
             mean[:] = floor
             for c in range(planes):
@@ -111,7 +112,7 @@ def _link_weights(first, end, stored, weight, links):  # type: ignore[no-untyped
                     d = flat[there + x] - flat[here + x]
                     mean[x] += share * d * d
             # Diagonal links are longer: half the weight.
-            pull, row = weight if k < 2 else weight / 2, links[k, y]
+            pull = weight if k < 2 else weight / 2
             for x in range(left, right):
                 row[x] = pull * _weight(mean[x])
 

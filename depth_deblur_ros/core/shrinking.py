@@ -19,6 +19,7 @@ import numpy as np
 
 SPREAD = (1.0, 1.0, 1.5, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)  # of the search along each axis of q
 ROUNDS, TRIES, SHRINK = 14, 200, 0.78
+TOGETHER = 6  # blocks of motions in a piece, so that its thread finds the tables in its cache
 
 
 @lru_cache(maxsize=1)
@@ -97,4 +98,5 @@ def _shrink(board, leads, steps, qs, best, told):  # type: ignore[no-untyped-def
                 return
             _try(steps[rounds], qs, q, found.size)
             rounds += 1
-            count = begin(board, np.int64(0), found.size // WIDTH)  # all work is of one kind
+            pieces = max(1, found.size // WIDTH // TOGETHER)
+            count = begin(board, np.int64(0), pieces)  # all work is of one kind

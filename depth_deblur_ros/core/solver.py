@@ -13,8 +13,6 @@ With `method` paper, 2 to 4 are the paper's: alternation.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 import time
 
@@ -27,7 +25,7 @@ from depth_deblur_ros.core.data import (
     Outcome,
     RgbdFrame,
 )
-from depth_deblur_ros.core.depth import fill_depth
+from depth_deblur_ros.core.depth import fill_depth, find_holes
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.joint import Effort, refine
 from depth_deblur_ros.core.latent import is_clean, LatentSteps, restore_coarse_to_fine
@@ -36,8 +34,8 @@ from depth_deblur_ros.core.light import as_colour, light_from_stored, stored_fro
 from depth_deblur_ros.core.likelihood import Pace
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.start import blind_start, Start
-from depth_deblur_ros.core.threads import at_most
-from depth_deblur_ros.core.trust import calibrated, OF_LIKELIHOOD, OF_SPECTRA
+from depth_deblur_ros.core.threads import at_most, both
+from depth_deblur_ros.core.trust import calibrated, edges_of, OF_LIKELIHOOD, OF_SPECTRA
 import numpy as np
 
 SATURATED, EVENLY = 0.98, 0.02  # stored values; how many more pixels a channel may have there
@@ -46,8 +44,8 @@ FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer
 # Of the joint refinement. A clean picture tells more the longer it is asked; another gives nearly
 # all that it knows at the first look, and of long blurs at half the size.
 CLEAN, NOISY = Effort(), Effort(readable=24.0)
-PACE = Pace(spacing=0.85, steps=7, last=9)
-BRIEF = replace(NOISY, pixels=52_000, moves=2, enough=0.4, doubt=1.15, pace=PACE)
+PACE = Pace(spacing=0.85, steps=6, last=8)
+BRIEF = replace(NOISY, pixels=52_000, moves=2, enough=0.4, doubt=1.15, instants=8.0, pace=PACE)
 
 
 def deblur(
@@ -70,14 +68,18 @@ def deblur(
     """
     params, frame = params or SolverParams(), undistorted(frame)
     began = time.monotonic()
-    with _threads(params.threads):
-        depth = fill_depth(frame.depth, frame.image, threads=params.threads)
+    with at_most(params.threads):
         if params.method == 'paper':
+            depth = fill_depth(frame.depth, frame.image, threads=params.threads)
             found, energies = _alternated(frame, depth, params)
             result = _finish(frame, depth, found, params, began, restore=restore)
             return replace(result, energies=energies)
-        grey = _grey(frame.image, _channels(frame.image))
-        found = blind_start(grey, depth, frame.camera, start)
+        holes, edges = both(
+            lambda: find_holes(frame.depth, frame.image),
+            lambda: edges_of(_grey(frame.image, _channels(frame.image))),
+        )
+        depth = holes.filled()
+        found = blind_start(edges, depth, frame.camera, start)
         if found.outcome is Outcome.SOLVED:
             effort = _effort(frame, params.mode, known=start is not None)
             found = replace(found, motion=_settled(frame, depth, found, effort), scales=())
@@ -117,7 +119,7 @@ def restore_known(
     """Restore the image under a known motion: the limit of any estimate of the motion."""
     params, frame = params or SolverParams(), undistorted(frame)
     began = time.monotonic()
-    with _threads(params.threads):
+    with at_most(params.threads):
         depth = fill_depth(frame.depth, frame.image, threads=params.threads)
         return _finish(frame, depth, Start(motion, Outcome.SOLVED, 1.0), params, began)
 
@@ -189,18 +191,6 @@ def _channels(image: FloatImage) -> FloatImage:
     """Give which channels (1, 3) make grey, 1 or 0: a mean of burnt and others is no light."""
     if image.ndim == 2:
         return np.ones((1, 1), np.float32)
-    burnt = (image[::SPARSE, ::SPARSE] > SATURATED).mean((0, 1))
+    burnt = np.array(cv2.mean((image[::SPARSE, ::SPARSE] > SATURATED).view(np.uint8))[:3])
     chosen = burnt <= burnt.min() + EVENLY
     return np.asarray(chosen[None], np.float32)
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """Run the kernels and OpenCV on this many threads, and give the process back as it was."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(count)
-    try:
-        with at_most(count):
-            yield
-    finally:
-        cv2.setNumThreads(before)

@@ -91,19 +91,18 @@ class Start:
 
 
 def blind_start(
-    grey: FloatImage,
+    edges: Edges,
     depth: FloatImage,
     camera: CameraIntrinsics,
     guess: Motion | None = None,
 ) -> Start:
     """
-    Find the motion from one grey image (H, W), stored values, and its filled depth (H, W) [m].
+    Find the motion from the edges of one grey image (H, W) and its filled depth (H, W) [m].
 
     guess: a further motion to start from. The sign of the answer is arbitrary: p and -p blur
     alike.
     """
-    axes = motion_axes(depth, camera)
-    edges = Edges(grey)
+    axes, grey = motion_axes(depth, camera), edges.grey
     if edges.along > CLEARLY_SHARP and edges.evenly > EVENLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
     spectra = look(grey, depth, camera, axes) if edges.across > OUT_OF_FOCUS else {}

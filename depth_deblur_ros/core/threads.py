@@ -17,6 +17,7 @@ from queue import Empty, SimpleQueue
 from threading import local, Thread
 from typing import Any, TypeVar
 
+import cv2
 from depth_deblur_ros.core.crew import Board, dismiss, empty_board, sched_yield
 from numba import config, njit
 from numba.core.compiler import Compiler
@@ -126,7 +127,7 @@ def _outcome(share: Callable[[], None]) -> BaseException | None:
     return None
 
 
-def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: Any) -> None:
+def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, Any]], data: Any) -> None:
     _here.sharing = True
     try:
         for first, end in pieces:
@@ -137,13 +138,15 @@ def _work(kernel: Callable[..., None], pieces: Iterator[tuple[int, int]], data: 
 
 @contextmanager
 def at_most(threads: int) -> Iterator[None]:
-    """Let `on_threads` use so many threads here, and give the thread back as it was."""
-    outer = getattr(_here, 'limit', None)
+    """Let `on_threads` use so many threads here, and OpenCV; leave both as they were."""
+    outer, of_opencv = getattr(_here, 'limit', None), cv2.getNumThreads()
     _here.limit = min(threads, cores())
+    cv2.setNumThreads(threads)
     try:
         yield
     finally:
         _here.limit = outer
+        cv2.setNumThreads(of_opencv)
 
 
 def cores() -> int:
@@ -184,6 +187,27 @@ def each(work: Callable[[Of], Result], items: Sequence[Of]) -> list[Result]:
 
     on_threads(some, len(items))
     return [found[k] for k in range(len(items))]
+
+
+def both(one: Callable[[], Result], other: Callable[[], Of]) -> tuple[Result, Of]:
+    """
+    Give what two functions give, side by side if that may be: the first one here.
+
+    So the memory of each comes and goes in the same thread's arena at every call.
+    """
+    found: dict[int, Any] = {}
+
+    def do(k: int, work: Callable[[], Any]) -> None:
+        found[k] = work()
+
+    works = (0, one), (1, other)
+    if threads_here() > 1:
+        own, share = (partial(_work, do, iter([work]), ()) for work in works)
+        _together(own, share, 2)
+    for work in works:
+        if work[0] not in found:  # there was no other thread, or it had not begun
+            do(*work)
+    return found[0], found[1]
 
 
 def with_crew(loop: Callable[..., None], *data: Any) -> None:

@@ -35,19 +35,15 @@ OF_BLUR = (0, 0, 0, 0, 0.007, 0.003)
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """How sharp a grey picture (H, W) is, as `sharpness` counts it."""
+    """
+    How sharp a grey picture (H, W) is, as `sharpness` counts it.
+
+    along, across: in the directions where it is least sharp, and sharpest.
+    """
 
     grey: FloatImage
-
-    @property
-    def along(self) -> float:
-        """In the direction where it is least sharp."""
-        return self._fine[0]
-
-    @property
-    def across(self) -> float:
-        """In the direction where it is sharpest."""
-        return self._fine[1]
+    along: float
+    across: float
 
     @cached_property
     def coarse(self) -> float:
@@ -67,9 +63,10 @@ class Edges:
         half = cv2.resize(self.grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         return np.asarray(half, np.float32)
 
-    @cached_property
-    def _fine(self) -> tuple[float, float]:
-        return sharpness(self.grey)
+
+def edges_of(grey: FloatImage) -> Edges:
+    """Look at the edges of a grey picture (H, W), stored values."""
+    return Edges(grey, *sharpness(grey))
 
 
 def sharpness(grey: FloatImage) -> tuple[float, float]:
