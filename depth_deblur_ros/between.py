@@ -61,12 +61,13 @@ class Between:
         """Give the motion (6,) alone."""
         return self.found[:6]
 
-    def way(self, seconds: float, readout: float, doubt: float) -> Way:
-        """Give it as a way of so many seconds, uncertain by a share; readout [s] of all rows."""
-        look = np.eye(9, 12)
-        look[6:] = 0
-        look[:, :6] += readout / seconds * self.stretch
-        look[:, 6:] += readout * seconds * self.skew
+    def way(self, seconds: float, readout: float | Vector, doubt: float) -> Way:
+        """Give it as a way of some time [s], uncertain by a share; readout (...) of all rows."""
+        rolled = np.asarray(readout)[..., None, None]
+        plain = np.eye(9, 12)
+        plain[6:] = 0
+        parts = [self.stretch / seconds, self.skew * seconds]
+        look = plain + rolled * np.concatenate(parts, 1)
         covariance = self.covariance.copy()
         covariance[:6, :6] += doubt**2 * np.outer(self.motion, self.motion)
         return Way(self.found, covariance, look)
@@ -78,9 +79,11 @@ def view_of(frame: RgbdFrame) -> View:
     while frame.camera.width // factor > WIDTH:
         factor *= 2
     width, height = frame.camera.width // factor, frame.camera.height // factor
-    grey = frame.image if frame.image.ndim == 2 else frame.image.mean(2)
-    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    even = 110 + 50 * (small - small.mean()) / max(float(small.std()), 1 / 255)
+    small = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
+    if small.ndim == 3:
+        small = cv2.transform(small, np.full((1, 3), 1 / 3))
+    mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(small))
+    even = 110 + 50 * (small - np.float32(mean)) / np.float32(max(spread, 1 / 255))
     depth = cv2.resize(frame.depth, (width, height), interpolation=cv2.INTER_NEAREST)
     return View(
         np.asarray(np.clip(even, 0, 255), np.uint8),
@@ -148,16 +151,17 @@ def _fit(j: Vector, flow: Vector, row: Vector, height: int) -> Between | None:
     row (n,): of each track, in heights of the picture [px] from the optical axis.
     """
     late = row[:, None, None] * j
-    both = np.concatenate([j, late[:, :, :3]], 2)
+    # Both axes of all tracks below each other: a product of matrices, not of many small ones.
+    both = np.concatenate([j, late[:, :, :3]], 2).reshape(-1, 9)
     weight = np.ones(len(flow))
     spread, ridge = FINEST, np.diag([1e-9] * 6 + [ROLL_RIDGE] * 3)
     for _ in range(ROUNDS):
-        weighted = weight[:, None, None] * both
-        information = np.einsum('nij,nik->jk', weighted, both) + ridge
+        weighted = (np.repeat(weight, 2)[:, None] * both).T
+        information = weighted @ both + ridge
         if weight.sum() < 6:
             return None
-        p = np.linalg.solve(information, np.einsum('nij,ni->j', weighted, flow))
-        miss = np.linalg.norm(flow - both @ p, axis=1)
+        p = np.linalg.solve(information, weighted @ flow.ravel())
+        miss = np.hypot(*(flow - (both @ p).reshape(-1, 2)).T)
         spread = max(FINEST, 1.25 * float(np.median(miss)))
         weight = np.square(np.clip(1 - np.square(miss / (CUT * spread)), 0, None))
     agree = weight > 0
@@ -166,7 +170,7 @@ def _fit(j: Vector, flow: Vector, row: Vector, height: int) -> Between | None:
     doubt = OPTIMISM * (spread / FINEST) * spread**2
     inverse = np.linalg.inv(information)
     stretch, skew = (
-        inverse @ np.einsum('nij,nik->jk', weighted, by)
+        inverse @ (weighted @ by.reshape(-1, 6))
         for by in (flow[:, 1, None, None] / height * j, late)
     )
     return Between(p, doubt * inverse, stretch, skew)

@@ -31,7 +31,7 @@ class Way:
     """
     What was measured from one frame to the next, (n,), and its covariance (n, n).
 
-    look (n, 12): it is look @ (c, b), of the way c and the mean acceleration b meanwhile; the
+    look (..., n, 12): it is look @ (c, b), of the way c and the mean acceleration b meanwhile; the
     first six are c but for a rolling shutter.
     """
 
@@ -42,11 +42,15 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Glide:
-    """Velocity u and acceleration at one time: mean (12,) and covariance (12, 12)."""
+    """
+    Velocity u and acceleration at one time: mean (12,) and covariance (12, 12).
+
+    Or several side by side, (..., 12) and (..., 12, 12), which `foreseen` takes on together.
+    """
 
     mean: Vector
     covariance: Vector
-    unrest: Vector  # (2,) standard deviation of the acceleration, of turns and of shifts
+    unrest: Vector  # (..., 2) standard deviation of the acceleration, of turns and of shifts
 
     @property
     def velocity(self) -> Vector:
@@ -58,11 +62,6 @@ class Glide:
         """Give the covariance (6, 6) of u."""
         return self.covariance[:6, :6]
 
-    @property
-    def known(self) -> bool:
-        """Tell whether anything was seen of the velocity yet."""
-        return bool(self.spread[0, 0] < FAST[0] ** 2)
-
     def measured(self, velocity: Vector, covariance: Vector) -> Glide:
         """Take in a measured velocity (6,) with its covariance (6, 6)."""
         look = np.eye(6, 12)
@@ -72,25 +71,26 @@ class Glide:
         """Go on in time, over a way that was measured or not."""
         return self.foreseen(seconds, way)[0]
 
-    def foreseen(self, seconds: float, way: Way | None) -> tuple[Glide, float]:
-        """Go on in time as moved; give also the log-likelihood of the way."""
+    def foreseen(self, seconds: float, way: Way | None) -> tuple[Glide, Vector]:
+        """Go on in time as moved; give also the log-likelihood (...) of the way."""
         go, noise = _steps(seconds, self.unrest)
-        mean, spread = go @ self.mean, go @ self.covariance @ go.T + noise
-        unrest, likely = self.unrest, 0.0
-        if way is not None:
-            look = np.zeros((len(way.motion), 24))
-            look[:, ENDS] = way.look
-            seen = spread @ look.T
-            miss, expected = way.motion - look @ mean, look @ seen + way.covariance
-            off = float(miss @ np.linalg.solve(expected, miss))
-            likely = -(off + float(np.linalg.slogdet(expected)[1])) / 2
-            missed = _missed(miss, expected)
-            if self.known and missed.max() > JUMP:
-                return unknown_glide().foreseen(seconds, way)[0], likely
-            unrest = _stirred(unrest, missed)
-            gain = seen @ np.linalg.inv(expected)
-            mean, spread = mean + gain @ miss, spread - gain @ seen.T
-        return Glide(mean[6:18], _even(spread[6:18, 6:18]), unrest), likely
+        mean, spread = self.mean @ go.T, go @ self.covariance @ go.T + noise
+        if way is None:
+            return _ended(mean, spread, self.unrest), np.zeros(mean.shape[:-1])
+        look = np.zeros((*way.look.shape[:-1], 24))
+        look[..., ENDS] = way.look
+        seen = spread @ _transposed(look)
+        miss, expected = way.motion - _times(look, mean), look @ seen + way.covariance
+        off = (miss * _solved(expected, miss)).sum(-1)
+        missed, gain = _missed(miss, expected), seen @ np.linalg.inv(expected)
+        mean, spread = mean + _times(gain, miss), spread - gain @ _transposed(seen)
+        found = _ended(mean, spread, _stirred(self.unrest, missed))
+        known = self.covariance[..., 0, 0] < FAST[0] ** 2  # anything was seen of the velocity yet
+        jumped = known & (missed.max(-1) > JUMP)
+        if jumped.any():
+            fresh, _ = unknown_glide().foreseen(seconds, way)
+            found = _either(jumped, fresh, found)
+        return found, -(off + np.linalg.slogdet(expected)[1]) / 2
 
     def before(self, seconds: float, way: Way) -> Glide:
         """Learn about now from the way that will be gone in the time ahead [RTS65]."""
@@ -112,10 +112,36 @@ def unknown_glide() -> Glide:
     return Glide(np.zeros(12), np.diag(spread**2), RESTLESS)
 
 
+def _ended(mean: Vector, spread: Vector, unrest: Vector) -> Glide:
+    """Forget the way, and the acceleration on it."""
+    return Glide(mean[..., 6:18], _even(spread[..., 6:18, 6:18]), unrest)
+
+
+def _either(first: Vector, one: Glide, other: Glide) -> Glide:
+    """Choose the first of two glides where that is said (...)."""
+    here = first[..., None]
+    return Glide(
+        np.where(here, one.mean, other.mean),
+        np.where(here[..., None], one.covariance, other.covariance),
+        np.where(here, one.unrest, other.unrest),
+    )
+
+
+def _times(matrix: Vector, vector: Vector) -> Vector:
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
+def _solved(matrix: Vector, vector: Vector) -> Vector:
+    return np.asarray(np.linalg.solve(matrix, vector[..., None])[..., 0])
+
+
 def _missed(miss: Vector, expected: Vector) -> Vector:
-    """Give how far turn and shift missed what was expected, (2,) mean squared, 1 as expected."""
-    parts = (slice(0, 3), slice(3, 6))
-    return np.array([miss[k] @ np.linalg.solve(expected[k, k], miss[k]) / 3 for k in parts])
+    """Give how far turn and shift missed what was expected, (..., 2) mean squared, 1 as that."""
+    parts = [
+        (miss[..., k] * _solved(expected[..., k, k], miss[..., k])).sum(-1) / 3
+        for k in (slice(0, 3), slice(3, 6))
+    ]
+    return np.stack(parts, -1)
 
 
 def _stirred(unrest: Vector, missed: Vector) -> Vector:
@@ -126,10 +152,11 @@ def _stirred(unrest: Vector, missed: Vector) -> Vector:
 
 
 def _steps(seconds: float, unrest: Vector) -> tuple[Vector, Vector]:
-    """Give what takes (u, a) to (c, u, a, b) `seconds` later, (24, 12), and its noise (24, 24)."""
+    """Give what takes (u, a) to (c, u, a, b) later, (24, 12), and its noise (..., 24, 24)."""
     go, effect = _effects(seconds)
-    size = np.diag(np.repeat(unrest**2, 3))
-    return go, (effect[:, None, :, None] * size[:, None, :]).reshape(24, 24)
+    size = np.repeat(unrest**2, 3, axis=-1)[..., None] * np.eye(6)
+    noise = effect[:, None, :, None] * size[..., None, :, None, :]
+    return go, noise.reshape(*unrest.shape[:-1], 24, 24)
 
 
 @lru_cache(maxsize=16)
@@ -152,4 +179,8 @@ def _effect(seconds: float) -> tuple[float, float, float]:
 
 
 def _even(covariance: Vector) -> Vector:
-    return np.asarray((covariance + covariance.T) / 2)
+    return np.asarray((covariance + _transposed(covariance)) / 2)
+
+
+def _transposed(matrix: Vector) -> Vector:
+    return matrix.swapaxes(-1, -2)

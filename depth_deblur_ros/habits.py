@@ -18,7 +18,8 @@ from depth_deblur_ros.glide import Glide, unknown_glide
 import numpy as np
 
 STEP = 0.3
-READOUTS = STEP * np.arange(-4, 5)  # of all rows, in frame intervals; none is longer than one
+# Of all rows, in frame intervals; none is longer than one.
+READOUTS: Vector = STEP * np.arange(-4.0, 5.0)
 EVEN = (0.0, 1.0)  # whether frames are taken evenly, whatever their stamps say
 ASSUMED = np.array(list(product(READOUTS, EVEN)))
 PLAIN = 3.0  # log-odds of a shutter that does not roll, before anything is seen
@@ -27,9 +28,13 @@ UNLIKELY = 200.0  # log-odds; no assumption is ever less likely
 
 @dataclass(frozen=True, eq=False)
 class Habits:
-    """The velocity under each assumption, and how likely it is: logs (n,), the best 0."""
+    """
+    The velocity under each assumption, and how likely it is: logs (n,), the best 0.
 
-    glides: tuple[Glide, ...] = (unknown_glide(),) * len(ASSUMED)
+    glides: of all readouts side by side, for each of EVEN.
+    """
+
+    glides: tuple[Glide, ...] = (unknown_glide(),) * len(EVEN)
     logs: Vector = field(default_factory=lambda: -PLAIN * (ASSUMED[:, 0] != 0))
 
     @property
@@ -54,13 +59,12 @@ class Habits:
 
     def moved(self, cadence: Cadence, between: Between | None) -> Habits:
         """Go on to the next frame."""
-        glides, logs = [], []
-        stamped, evened, usual = cadence.intervals[-1], cadence.even, cadence.usual
-        for glide, (readout, even) in zip(self.glides, ASSUMED, strict=True):
-            seconds = evened if even else stamped
-            way = between.way(seconds, readout * usual, 0.0) if between else None
+        glides, logs, readouts = [], [], READOUTS * cadence.usual
+        for glide, even in zip(self.glides, EVEN, strict=True):
+            seconds = cadence.even if even else cadence.intervals[-1]
+            way = between.way(seconds, readouts, 0.0) if between else None
             moved, likely = glide.foreseen(seconds, way)
             glides.append(moved)
-            logs.append(likely)
-        summed = self.logs + np.array(logs)
+            logs.append(np.broadcast_to(likely, len(READOUTS)))
+        summed = self.logs + np.stack(logs, 1).ravel()
         return Habits(tuple(glides), np.maximum(summed - summed.max(), -UNLIKELY))

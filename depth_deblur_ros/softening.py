@@ -80,7 +80,8 @@ def _power(view: View, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Vector:
     half = SIDE // 2
     patches = sliding_window_view(view.grey, (SIDE, SIDE))[y - half, x - half].astype(np.float32)
     patches -= patches.mean(axis=(1, 2), keepdims=True)
-    power = np.square(np.abs(scipy.fft.rfft2(patches * _WINDOW)))
+    seen = scipy.fft.rfft2(patches * _WINDOW, overwrite_x=True)
+    power = np.square(seen.real) + np.square(seen.imag)
     noise = np.median(power[:, _NOISE], axis=1)
     return np.concatenate([power[:, _BAND], noise[:, None]], axis=1)
 

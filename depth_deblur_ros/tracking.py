@@ -25,6 +25,7 @@ from depth_deblur_ros.core.data import DeblurResult, Motion, Outcome, RgbdFrame,
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.params import SolverParams
 from depth_deblur_ros.core.solver import deblur, restore_known
+from depth_deblur_ros.core.threads import at_most
 from depth_deblur_ros.glide import Glide, unknown_glide, Way
 from depth_deblur_ros.gyro import Gyro
 from depth_deblur_ros.habits import Habits
@@ -116,7 +117,8 @@ class Tracker:
         if params.neighbours == 'ignore':
             return Tracked(self._solve(frame, params), told)
         began = time.monotonic()
-        context = self._context(frame, following, told, params)
+        with at_most(params.threads):
+            context = self._context(frame, following, told, params)
         spent = time.monotonic() - began
         alone = self._alone(frame, params, context.expected())
         joined = join(alone, context, frame.camera)

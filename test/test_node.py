@@ -237,7 +237,7 @@ def test_a_deadline_that_is_missed_steps_the_mode_down_and_up(peer, start):
 
     send(8)
     assert [set(m.data) for m in images] == [{191}] * 6 + [{64}] * 2  # 64: no image step
-    peer.until(lambda: peer.status()[1]['mode in use'] == 'motion')
+    peer.until(lambda: peer.status()[1].get('mode in use') == 'motion')
     values = peer.status()[1]
     assert (values['mode'], values['mode stepped down']) == ('full', '2')
     assert parameters(peer, deadline_ms=100.0) == []  # room for what was asked for
