@@ -1,14 +1,17 @@
 """
-What the live node itself costs: how long after its stamp a result is out, less the solver's time.
+How many frames a second the live node gets through, and what it costs beside the solver.
 
-The sample bag at 30 Hz, 640x480, over the transport profile; the solver takes no time at all, so
-that what is left is the transport, decoding, pairing, handing over and publishing. Frames
-are taken one by one: what tracking costs belongs to the solver.
+A bag's frames at 30 Hz, over the transport profile; first with a solver that takes no time at all,
+frames taken one by one, so that what is left is the transport, decoding, pairing, handing over and
+publishing, then with the real one, in the modes motion and fast, frames tracked. `lockstep.py`
+tells how good the results are.
+
+usage: python scripts/bench_node.py [--bag BAG] [--threads N]
 """
 
 from __future__ import annotations
 
-import json
+import argparse
 import os
 from pathlib import Path
 import subprocess
@@ -22,6 +25,7 @@ from depth_deblur_ros.messages import stamp_ns
 from depth_deblur_ros.node import DeblurNode
 from depth_deblur_ros.node import main as node_main
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
 import numpy as np
 import play_bag
 import rclpy
@@ -29,6 +33,7 @@ from sensor_msgs.msg import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 FRAMES, RATE = 300, 30.0
+PATIENCE_S = 60.0
 
 
 def no_work(
@@ -64,17 +69,27 @@ def private_environment(folder: str) -> dict[str, str]:
 
 
 class Listener:
-    """What is seen from outside: the ages of the images when they come, and what the node says."""
+    """What is seen from outside: the ages of motions when they come, what the node says."""
 
-    def __init__(self, pid: int) -> None:
+    def __init__(self, pid: int, pictures: bool) -> None:
         self.ages: list[float] = []
-        self.said: dict[str, str] = {}
-        self._pid, self._begun = pid, (0.0, 0.0)
+        self.state, self.said = '', dict[str, str]()
+        self._pid, self._begun = pid, 0.0
         self.node = rclpy.create_node('listener')
-        self.node.create_subscription(Image, 'deblurred/image', self._see, 10)
+        self.node.create_subscription(TwistStamped, 'displacement', self._see, 10)
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
+        if pictures:
+            self.node.create_subscription(Image, 'deblurred/image', lambda _: None, 10)
 
-    def spin(self, player: subprocess.Popen[str]) -> None:
+    def await_node(self) -> None:
+        """Listen until the node waits for frames."""
+        end = time.monotonic() + PATIENCE_S
+        while not self.state.startswith('nothing on'):
+            if time.monotonic() > end:
+                raise TimeoutError(f'the node is not ready: {self.state!r}')
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+
+    def spin(self, player: subprocess.Popen[bytes]) -> None:
         """Listen until the player has ended, and the node has said so."""
         while player.poll() is None:
             rclpy.spin_once(self.node, timeout_sec=0.1)
@@ -83,61 +98,73 @@ class Listener:
             rclpy.spin_once(self.node, timeout_sec=0.1)
 
     def load(self) -> float:
-        """Give the share of a processor that the node has taken since the first image."""
-        time_then, used_then = self._begun
-        return (cpu_seconds(self._pid) - used_then) / (time.monotonic() - time_then)
+        """Give the processor time that the node has taken for each motion since the first [s]."""
+        return (cpu_seconds(self._pid) - self._begun) / max(len(self.ages) - 1, 1)
 
-    def _see(self, message: Image) -> None:
+    def _see(self, message: TwistStamped) -> None:
         self.ages.append(time.time() - stamp_ns(message.header) / 1e9)
         if len(self.ages) == 1:
-            self._begun = time.monotonic(), cpu_seconds(self._pid)
+            self._begun = cpu_seconds(self._pid)
 
     def _hear(self, message: DiagnosticArray) -> None:
+        self.state = message.status[0].message
         self.said = {entry.key: entry.value for entry in message.status[0].values}
 
 
-def measure() -> None:
-    """Run node, player and a listener, and print the figures."""
+def measure(mode: str, bag: Path, threads: int) -> str:
+    """Run node, player and a listener, without a solver where there is no mode; give a line."""
     own = [sys.executable, __file__]
     remaps = [w for old, new in play_bag.REMAP.items() for w in ('-r', f'{old}:={new}')]
-    alone = ('-p', 'neighbours:=ignore')
-    node = subprocess.Popen([*own, 'node', '--ros-args', *remaps, *alone])
-    player = subprocess.Popen(
-        [sys.executable, str(ROOT / 'scripts/play_bag.py'), '--frames', str(FRAMES)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    told = [f'mode:={mode}', f'threads:={threads}'] if mode else ['neighbours:=ignore']
+    options = [w for option in told for w in ('-p', option)]
+    node = subprocess.Popen([*own, 'solve' if mode else 'idle', '--ros-args', *remaps, *options])
     rclpy.init()
-    listener = Listener(node.pid)
+    listener = Listener(node.pid, pictures=mode != 'motion')
     try:
+        listener.await_node()
+        play = [sys.executable, str(ROOT / 'scripts/play_bag.py'), '--bag', str(bag)]
+        player = subprocess.Popen(
+            [*play, '--frames', str(FRAMES), '--rate', str(RATE)],
+            stdout=subprocess.DEVNULL,
+        )
         listener.spin(player)
         load = listener.load()
-        assert player.stdout
-        sent = len(json.loads(player.stdout.read())['stamps'])
     finally:
         node.terminate()
         node.wait(30)
         listener.node.destroy_node()
         rclpy.shutdown()
-    report(sent, listener, load)
+    return line(mode or 'no solver', listener, load)
 
 
-def report(sent: int, listener: Listener, load: float) -> None:
-    """Print the figures."""
+def line(what: str, listener: Listener, load: float) -> str:
+    """Give the figures of one run."""
     said = listener.said
-    published = [1000 * float(said[f'latency {p} [s]']) for p in ('p50', 'p99')]
-    seen = 1000 * np.percentile(listener.ages, [50, 99])
-    print(f'live node without a solver, 640x480 at {RATE:g} Hz, transport profile on')
-    print(f'frames sent {sent}, published {said["published"]}, seen {len(listener.ages)}')
-    print(f'dropped {said["dropped"]}, lost in transport {said["colour lost in transport"]}')
-    for name, (p50, p99) in (('published', published), ('seen outside', seen)):
-        print(f'stamp to result {name:12}  p50 {p50:6.1f} ms   p99 {p99:6.1f} ms')
-    print(f'processor of the node         {100 * load:6.1f} %')
+    kinds = 'solver', 'latency'
+    pairs = [[float(said[f'{kind} {p} [s]']) for p in ('p50', 'p99')] for kind in kinds]
+    pairs.append(np.percentile(listener.ages, [50, 99]).tolist())
+    times = ' | '.join(f'{1000 * p50:.1f} / {1000 * p99:.1f}' for p50, p99 in pairs)
+    rate = RATE * int(said['published']) / FRAMES
+    lost = f'{said["dropped"]}, {said["colour lost in transport"]}'
+    return f'| {what} | {rate:.1f} | {lost} | {times} | {1000 * load:.1f} |'
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description='How many frames a second the node gets through.')
+    parser.add_argument('--bag', type=Path, default=play_bag.BAG)
+    parser.add_argument('--threads', type=int, default=2)
+    args = parser.parse_args()
+    print(f'{FRAMES} frames at {RATE:g} Hz, transport profile on; p50 / p99 in ms')
+    print('| solver | Hz | overtaken, lost | solved | published | seen outside | CPU a frame |')
+    print('|---|---|---|---|---|---|---|')
+    for mode in ('', 'motion', 'fast'):
+        print(measure(mode, args.bag, args.threads), flush=True)
 
 
 if __name__ == '__main__':
-    if sys.argv[1:2] == ['node']:
-        sys.exit(node_main(sys.argv, IdleNode))
+    if sys.argv[1:2] in (['idle'], ['solve']):
+        sys.exit(node_main(sys.argv, IdleNode if sys.argv[1] == 'idle' else DeblurNode))
     with tempfile.TemporaryDirectory() as logs:
         os.environ.update(private_environment(logs))
-        measure()
+        main()
