@@ -16,7 +16,7 @@ SECONDS = float(os.environ.get('SOAK_SECONDS', '120'))
 PARTS = 4
 SETTLED_S = 60.0  # before them; until then tables are still made
 LAST_S = 1.0  # of an idle node
-SLOPE_LIMIT = 0.003  # MB/s: 11 MB in an hour
+GROWTH_LIMIT = 0.1  # MB in a part: 12 MB in an hour
 PLAYER = ros_parts.ROOT / 'scripts/play_bag.py'
 WATCHED = sys.executable, ros_parts.ROOT / 'test/watched_node.py'
 LOSS_LIMIT = 0.001  # of what is sent, beside what came while a busy machine stopped the node
@@ -82,5 +82,5 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
     assert int(values['depth arrived']) == sent - lost['depth']
     assert sum(lost.values()) - sum(queued.values()) <= LOSS_LIMIT * sent, figures
     # A leak grows in each part; room for messages that have to wait is made once, in some.
-    assert growth.min() < SLOPE_LIMIT * SECONDS / PARTS, figures
+    assert growth.min() < GROWTH_LIMIT, figures
     assert int(values['published']) > 0
