@@ -13,6 +13,7 @@ from depth_deblur_ros.core.evidence import (
 )
 from depth_deblur_ros.core.geometry import flow
 from depth_deblur_ros.core.scores import EVEN, rough_scores, scores
+from depth_deblur_ros.core.search import FEWER, seen_at
 from depth_deblur_ros.core.spectra import patch_spectra
 from depth_deblur_ros.core.templates import ACROSS, PATCH, REACH, template_table
 from hypothesis import given, settings
@@ -38,7 +39,7 @@ def evidence_of(grey):
 
 
 def spectra_of(grey):
-    return gather_spectra(grey, WHOLE, DEPTH, CAMERA, motion_axes(DEPTH, CAMERA))
+    return gather_spectra((grey, WHOLE, DEPTH), CAMERA, motion_axes(DEPTH, CAMERA))
 
 
 def made_up_evidence(rng):
@@ -66,12 +67,18 @@ def test_spectra_are_those_of_each_patch_by_itself(table):
         assert weight[k] == pytest.approx(sum(np.square(f).mean() for f in fields), rel=1e-4)
 
 
+def test_one_motion_is_heard_alone_as_among_all():
+    spectra, q = spectra_of(swept(texture(1), 7)), np.array([5.0, -3, 1, 0.5, 0, 0, 0, 0, 0])
+    assert seen_at(spectra, q) == pytest.approx(-scores(q[None], spectra.evidence())[0], rel=1e-4)
+
+
 @pytest.mark.parametrize(
     'shape', [(96, 96), (97, 130), (144, 200), (240, 320), (480, 640), (1200, 1920)]
 )
-def test_patches_lie_inside_from_border_to_border(shape):
-    corners = np.array(_corners(shape))
-    assert len(corners) <= MAX_PATCHES
+@pytest.mark.parametrize('most', [MAX_PATCHES, FEWER])
+def test_patches_lie_inside_from_border_to_border(shape, most):
+    corners = np.array(_corners(shape, most))
+    assert len(corners) <= most
     assert len(np.unique(corners, axis=0)) == len(corners)
     assert (corners >= 0).all()
     assert (corners + PATCH <= shape).all()

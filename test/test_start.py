@@ -60,6 +60,34 @@ def test_a_short_blur_is_found_close_up(length, angle):
     assert flow_error(result, sideways(length, angle)) < 0.5
 
 
+@pytest.mark.parametrize('length', [3, 6, 14])
+@pytest.mark.parametrize('angle', [0.4, 1.9])
+def test_a_motion_is_found_near_a_guess(length, angle):
+    guess = sideways(1.3 * length, angle + 0.2)
+    result = blind_start(swept(texture(1), length, angle, 0.005), DEPTH, CAMERA, guess)
+    assert result.outcome is Outcome.SOLVED
+    assert flow_error(result, sideways(length, angle)) < 0.5
+
+
+def test_a_wrong_guess_does_no_harm():
+    grey, guess = swept(texture(1), 12, 0.4, 0.005), sideways(25, 2.0)
+    result = blind_start(grey, DEPTH, CAMERA, guess)
+    assert result.outcome is Outcome.SOLVED
+    assert flow_error(result, sideways(12, 0.4)) < 0.5
+
+
+@pytest.mark.parametrize(('said', 'times'), [(start.CLOSE_HINT / 2, 0), (start.CLOSE_HINT * 2, 1)])
+def test_what_shows_nothing_close_up_is_not_searched_there(monkeypatch, said, times):
+    camera = CameraIntrinsics(262.0, 262.0, 319.5, 239.5, 640, 480)  # of more than one scale
+    grey, depth = np.tile(swept(texture(1), 7, 0.4), (2, 2)), np.tile(DEPTH, (2, 2))
+    search, searched = start.find_short, []
+    monkeypatch.setattr(start, 'seen_at', lambda *_: said)
+    monkeypatch.setattr(start, 'find_short', lambda *told: searched.append(0) or search(*told))
+    result = blind_start(grey, depth, camera, sideways(7, 0.4))
+    assert len(searched) == times
+    assert result.outcome is Outcome.SOLVED
+
+
 @pytest.mark.parametrize('radius', [4, 7])
 def test_a_lens_out_of_focus_is_no_motion(radius):
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]

@@ -13,6 +13,7 @@ rows may see different turns.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
@@ -28,9 +29,9 @@ from depth_deblur_ros.core.templates import (
 )
 import numpy as np
 
-STEP = 48  # px between patches
+STEP = 48  # px between patches, about
 CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sensor
-MAX_PATCHES = 400
+MAX_PATCHES = 280
 SPARSE = 4  # every so many-th pixel of a patch tells its depth
 
 
@@ -68,15 +69,20 @@ class Spectra:
 
 
 def gather_spectra(
-    grey: FloatImage, valid: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+    images: tuple[FloatImage, FloatImage, FloatImage],
+    camera: CameraIntrinsics,
+    axes: Vector,
+    most: int = MAX_PATCHES,
 ) -> Spectra:
     """
-    Look at the patches of one scale.
+    Look at the patches of one scale, at about `most` of them.
 
-    grey (H, W), valid (H, W) 0..1 (0 = saturated or not trusted), depth (H, W) [m]; axes G (9, 9).
+    images (H, W) each: grey, what counts of it 0..1 (0 = saturated or not trusted), and depth [m];
+    axes G (9, 9).
     """
     table = template_table()
-    corners = _corners(grey.shape)
+    grey, valid, depth = images
+    corners = _corners(grey.shape, most)
     power, weight = patch_spectra(grey, valid, corners, table.bins)
     logs = np.log(power + np.float32(1e-12))
     there, back = table.nuisance_blocks
@@ -92,17 +98,18 @@ def gather_spectra(
 
 def patches_in(size: tuple[int, int]) -> int:
     """Give how many patches an image of (width, height) px holds."""
-    return len(_corners(size))
+    return len(_corners(size, MAX_PATCHES))
 
 
-def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Spread patches evenly over the image, about STEP apart, from border to border."""
-    spots = []
-    for side in shape[:2]:
-        count = max(1, round((side - PATCH) / STEP) + 1)
-        spots.append(np.linspace(0, side - PATCH, count).round().astype(int))
-    grid = [(int(y), int(x)) for y in spots[0] for x in spots[1]]
-    return grid[:: -(-len(grid) // MAX_PATCHES)]
+def _corners(shape: tuple[int, ...], most: int) -> list[tuple[int, int]]:
+    """Spread patches evenly from border to border: STEP apart, farther if that is too many."""
+    counts = [max(1, round((side - PATCH) / STEP) + 1) for side in shape[:2]]
+    share = min(1.0, math.sqrt(most / math.prod(counts)))
+    ys, xs = (
+        np.linspace(0, side - PATCH, max(1, int(share * count))).round().astype(int)
+        for side, count in zip(shape, counts, strict=False)
+    )
+    return [(int(y), int(x)) for y in ys for x in xs]
 
 
 def _flow_of_q(

@@ -18,7 +18,13 @@ from functools import lru_cache
 
 import cv2
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Vector
-from depth_deblur_ros.core.evidence import gather_spectra, patches_in, Spectra, thinned
+from depth_deblur_ros.core.evidence import (
+    gather_spectra,
+    MAX_PATCHES,
+    patches_in,
+    Spectra,
+    thinned,
+)
 from depth_deblur_ros.core.scores import (
     CLOSE,
     common_score,
@@ -35,12 +41,14 @@ import numpy as np
 
 SCALES = (1, 2, 4)
 FEW = 4  # patches; a coarse scale with less has no vote
+FEWER = 56  # patches of a scale that are looked at where the motion is about known
 MANY = 40  # patches of a scale, of which half are heard on all proposals, roughly
 HEARD_TWICE, CANDIDATES = 1500, 1000  # proposals that are judged exactly; that seeds are of
 SEEDS = 8  # distinct motions that each scale refines
 NEAR = 3.0  # px; how wide it is searched around a guess
 DEEPER = 1.08  # times as deep bands make twice a motion likelier
 ROOM = 10  # px of templates around the guess, more than the search around it goes
+BESIDE = 2  # px of them around a motion that is not searched around
 TRIES_OF_SEEDS = 100  # in each round, around each of them
 DESCENTS, FLATTEST = 2, 1e-3  # Newton's steps; least share of the largest curvature
 ALONG = (0.2, 0.4, 0.7, 1.0, 1.4)  # of such a step are tried
@@ -81,6 +89,11 @@ def find_near(spectra: Mapping[float, Spectra], guess: Vector) -> tuple[Vector, 
     return _settled(guess, scales, NEAR), scales
 
 
+def seen_at(spectra: Spectra, q: Vector) -> float:
+    """Give -S of one motion (9,) by what one scale saw."""
+    return -float(scores(q[None], spectra.evidence_around(q, BESIDE))[0])
+
+
 def find_short(scale: Scale, spectra: Spectra, near: Vector | None) -> tuple[Vector, list[Scale]]:
     """
     Find a short q (9,), at full scale and close up, around one if it is known.
@@ -90,20 +103,23 @@ def find_short(scale: Scale, spectra: Spectra, near: Vector | None) -> tuple[Vec
     """
     around, room = (np.zeros(9), CLOSE_REACH) if near is None else (near, ROOM)
     both = [scale, Scale(CLOSE, spectra.evidence_around(around, round(room / CLOSE)))]
-    known = near is not None
-    found = (
-        shrink_around(around[None, :6], both, NEAR)
-        if known
-        else _best(_short(), both, CLOSE_SEEDS)
-    )
+    found = _best(_short(), both, CLOSE_SEEDS) if near is None else near[None, :6]
     found = _by_rows(shrink_around(found, both, 1.0))
     return found[int(np.argmin(common_score(found, both)))], both
 
 
 def look(
-    grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+    grey: FloatImage,
+    depth: FloatImage,
+    camera: CameraIntrinsics,
+    axes: Vector,
+    most: int = MAX_PATCHES,
 ) -> dict[float, Spectra]:
-    """Look at each scale that holds enough patches, at the full one always, by its factor."""
+    """
+    Look at each scale that holds enough patches, at the full one always, by its factor.
+
+    most: patches of a scale that are looked at; where the motion is about known FEWER will do.
+    """
     whole = _whole(grey)
     found: dict[float, Spectra] = {}
     for factor in SCALES:
@@ -111,7 +127,7 @@ def look(
         if min(size) < PATCH or (found and patches_in(size) < FEW):
             break
         images = grey, whole, depth
-        found[factor] = _seen(images, camera.scaled(*size), axes, cv2.INTER_AREA)
+        found[factor] = _seen(images, camera.scaled(*size), axes, cv2.INTER_AREA, most)
     return found
 
 
@@ -123,13 +139,17 @@ def look_again(
     if min(size) < PATCH or patches_in(size) < FEW:
         return {}
     images = (grey, _whole(grey), depth)
-    return {WITNESS: _seen(images, camera.scaled(*size), axes, cv2.INTER_AREA)}
+    return {WITNESS: _seen(images, camera.scaled(*size), axes, cv2.INTER_AREA, MAX_PATCHES)}
 
 
 def close_up(
-    grey: FloatImage, depth: FloatImage, camera: CameraIntrinsics, axes: Vector
+    grey: FloatImage,
+    depth: FloatImage,
+    camera: CameraIntrinsics,
+    axes: Vector,
+    most: int = MAX_PATCHES,
 ) -> Spectra:
-    """Look at the picture's middle at twice its size."""
+    """Look at the picture's middle at twice its size; most as in `look`."""
     rows, columns = (
         min(side, max(side // 2, least))
         for side, least in zip(grey.shape, CLOSE_SIDES, strict=True)
@@ -138,7 +158,7 @@ def close_up(
     middle = np.s_[top : top + rows, left : left + columns]
     cut = camera.cropped(left, top, columns, rows)
     images = (grey[middle], _whole(grey[middle]), depth[middle])
-    return _seen(images, cut.scaled(2 * columns, 2 * rows), axes, cv2.INTER_CUBIC)
+    return _seen(images, cut.scaled(2 * columns, 2 * rows), axes, cv2.INTER_CUBIC, most)
 
 
 def _seen(
@@ -146,14 +166,15 @@ def _seen(
     camera: CameraIntrinsics,
     axes: Vector,
     how: int,
+    most: int,
 ) -> Spectra:
     """Look at grey values, what counts of them, and depth at the size of a camera."""
-    size = (camera.width, camera.height)
+    size, ways = (camera.width, camera.height), (how, cv2.INTER_AREA, cv2.INTER_NEAREST)
     grey, whole, depth = (
         np.asarray(cv2.resize(array, size, interpolation=way), np.float32)
-        for array, way in zip(images, (how, cv2.INTER_AREA, cv2.INTER_NEAREST), strict=True)
+        for array, way in zip(images, ways, strict=True)
     )
-    return gather_spectra(grey, whole, depth, camera, axes)
+    return gather_spectra((grey, whole, depth), camera, axes, most)
 
 
 def _scales(spectra: Mapping[float, Spectra], near: Vector | None = None) -> list[Scale]:

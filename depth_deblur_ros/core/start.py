@@ -15,17 +15,19 @@ from dataclasses import dataclass, field
 import math
 
 from depth_deblur_ros.core.data import CameraIntrinsics, FloatImage, Motion, Outcome, Vector
-from depth_deblur_ros.core.evidence import motion_axes, Spectra
+from depth_deblur_ros.core.evidence import MAX_PATCHES, motion_axes, Spectra
 from depth_deblur_ros.core.geometry import blur_length
 from depth_deblur_ros.core.scores import CLOSE, common_score, Scale, scores, SHARE
 from depth_deblur_ros.core.search import (
     ask_twice,
     close_up,
+    FEWER,
     find,
     find_near,
     find_short,
     look,
     look_again,
+    seen_at,
     slope_and_bend,
 )
 from depth_deblur_ros.core.trust import covariance_from_curvature, Edges
@@ -38,6 +40,7 @@ SHORT_TRUST = 0.11  # least -S at full scale of a short blur
 CLOSE_BELOW = 9.0  # px; shorter blurs are looked at close up
 CLOSE_TRUST = 0.25  # least common -S at full scale and close up
 CLOSE_SHARE = 0.12  # least -S close up by itself
+CLOSE_HINT = 0.04  # -S close up of what all scales found, below which no search there reaches that
 PLAIN, PLAIN_TRUST = 5.0, 0.14  # px; longer blurs show as much at full scale as well
 CLOSE_BIAS = 1.0  # px; close up, blurs seem longer: the root of both squares
 LONG_TRUST = 0.2  # least common -S of a long blur
@@ -102,33 +105,44 @@ def blind_start(
     guess: a further motion to start from. The sign of the answer is arbitrary: p and -p blur
     alike.
     """
-    axes, grey = motion_axes(depth, camera), edges.grey
+    axes, first = motion_axes(depth, camera), None
     if edges.along > CLEARLY_SHARP and edges.evenly > EVENLY_SHARP:
         return _nothing(Outcome.SHARP, axes)
-    spectra = look(grey, depth, camera, axes) if edges.across > OUT_OF_FOCUS else {}
+    picture = edges.grey, depth, camera, axes
+    in_focus = edges.across > OUT_OF_FOCUS
+    spectra = look(*picture, FEWER if guess else MAX_PATCHES) if in_focus else {}
     if not spectra:
         return _nothing(Outcome.FAILED, axes)
 
     def length(q: Vector) -> float:
         return blur_length(axes @ q, depth, camera)
 
-    first = np.asarray(np.linalg.solve(axes, guess.by_rows)) if guess else None
-    q, scales = _found(spectra, first, length, edges)
+    found = None
+    if guess:
+        first = np.asarray(np.linalg.solve(axes, guess.by_rows), np.float64)
+        found = _near(spectra, first, length, edges)
+        spectra = spectra if found else look(*picture)
+    q, scales = found or _anywhere(spectra, first, length)
     seen, trusted = 0.0, _trusted(q, length(q), scales, edges)
     alone = trusted and len(spectra) == 1 and guess is None and length(q) > WITNESSED
-    if alone and _refuted(q, spectra | look_again(grey, depth, camera, axes), length, edges):
+    if alone and _refuted(q, spectra | look_again(*picture), length):
         return _nothing(Outcome.FAILED, axes)
     look_closer = length(q) < CLOSE_BELOW if trusted else edges.along > EDGED
     if look_closer and scales[0].factor == 1:
-        close = close_up(grey, depth, camera, axes)
-        closer, both = find_short(scales[0], close, q if trusted else None)
-        seen = float(-common_score(closer[None], both)[0])
-        if _short_trusted(closer, length(closer), both):
-            q, scales, trusted = closer, both, True
-        elif len(scales) == 1:  # nobody has confirmed it
-            trusted = False
+        close = close_up(*picture, FEWER if found else MAX_PATCHES)
+        if not trusted or len(scales) == 1 or seen_at(close, q) > CLOSE_HINT:
+            short, seen = _closer(q if trusted else None, scales[0], close, length)
+            trusted = bool(short) or (trusted and len(scales) > 1)  # else nobody has confirmed it
+            q, scales = short or (q, scales)
     if not trusted:
         return _nothing(_without_motion(edges, seen, alone=len(spectra) == 1), axes)
+    return _solved(q, scales, length, axes)
+
+
+def _solved(
+    q: Vector, scales: list[Scale], length: Callable[[Vector], float], axes: Vector
+) -> Start:
+    """Say what a motion that is trusted is worth."""
     quality = min(1.0, float(-common_score(q[None], scales)[0]) / BELIEF)
     covariance = _covariance(q, scales, axes)
     doubt = LONELY_DOUBT if len(scales) == 1 and quality < LONELY else 1 / quality
@@ -151,29 +165,42 @@ def _without_motion(edges: Edges, seen: float, *, alone: bool) -> Outcome:
     return Outcome.SHARP if sharp else Outcome.FAILED
 
 
-def _found(
+def _near(
+    spectra: Mapping[float, Spectra],
+    first: Vector,
+    length: Callable[[Vector], float],
+    edges: Edges,
+) -> tuple[Vector, list[Scale]] | None:
+    """Search around the guess; None where that gives nothing to believe."""
+    q, scales = find_near(spectra, first)
+    holds = length(q - first) <= ASTRAY and _trusted(q, length(q), scales, edges)
+    return (q, scales) if holds else None
+
+
+def _anywhere(
     spectra: Mapping[float, Spectra],
     first: Vector | None,
     length: Callable[[Vector], float],
-    edges: Edges,
 ) -> tuple[Vector, list[Scale]]:
-    """Search around the guess, and everywhere where that gives nothing to believe."""
-    if first is not None:
-        q, scales = find_near(spectra, first)
-        if length(q - first) <= ASTRAY and _trusted(q, length(q), scales, edges):
-            return q, scales
+    """Search everywhere, around a guess too if there is one."""
     q, scales = find(spectra, first)
     return ask_twice(q, scales) if length(q) > HALVED else (q, scales)
 
 
+def _closer(
+    near: Vector | None, scale: Scale, close: Spectra, length: Callable[[Vector], float]
+) -> tuple[tuple[Vector, list[Scale]] | None, float]:
+    """Search close up; None where that gives nothing to believe, and -S of what is likeliest."""
+    q, both = find_short(scale, close, near)
+    seen = float(-common_score(q[None], both)[0])
+    return ((q, both) if _short_trusted(q, length(q), both) else None), seen
+
+
 def _refuted(
-    q: Vector,
-    spectra: Mapping[float, Spectra],
-    length: Callable[[Vector], float],
-    edges: Edges,
+    q: Vector, spectra: Mapping[float, Spectra], length: Callable[[Vector], float]
 ) -> bool:
     """Tell whether one more scale, searched together with the others, finds another motion."""
-    other, _ = _found(spectra, None, length, edges)
+    other, _ = _anywhere(spectra, None, length)
     return min(length(q - other), length(q + other)) > APART * length(q)
 
 
