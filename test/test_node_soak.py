@@ -8,6 +8,7 @@ import play_bag
 import pytest
 import ros_parts
 from sensor_msgs.msg import Image
+from soak import memory_mb
 from watched_node import EVERY_S
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
@@ -17,6 +18,7 @@ PARTS = 4
 SETTLED_S = 60.0  # before them; until then tables are still made
 LAST_S = 1.0  # of an idle node
 GROWTH_LIMIT = 0.1  # MB in a part: 12 MB in an hour
+RESIDENT_LIMIT = 400.0  # MB, of what no allocator knows, too
 PLAYER = ros_parts.ROOT / 'scripts/play_bag.py'
 WATCHED = sys.executable, ros_parts.ROOT / 'test/watched_node.py'
 LOSS_LIMIT = 0.001  # of what is sent, beside what came while a busy machine stopped the node
@@ -58,7 +60,7 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
         for _ in range(PARTS):
             sent += stream(peer, SECONDS / PARTS, tmp_path / 'player')
             idle.append(used_mb(peer, used))
-        values = peer.settled(timeout=60)
+        values, resident = peer.settled(timeout=60), memory_mb(node.pid)
         assert node.stop() == 0
     finally:
         node.kill()
@@ -73,6 +75,7 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
         'of these in a full queue': queued,
         'published': int(values['published']),
         'memory in use [MB]': np.round(idle, 2).tolist(),
+        'resident [MB]': round(resident),
         'latency p99 [s]': float(values['latency p99 [s]']),
     }
     record_property('soak', figures)
@@ -83,4 +86,5 @@ def test_three_minutes_at_thirty_hertz(monkeypatch, tmp_path, record_property):
     assert sum(lost.values()) - sum(queued.values()) <= LOSS_LIMIT * sent, figures
     # A leak grows in each part; room for messages that have to wait is made once, in some.
     assert growth.min() < GROWTH_LIMIT, figures
+    assert resident < RESIDENT_LIMIT, figures
     assert int(values['published']) > 0

@@ -29,7 +29,7 @@ from depth_deblur_ros.core.templates import (
 )
 import numpy as np
 
-STEP = 48  # px between patches, about
+STEP = 48  # px between patches, about; more where that makes too many
 CLIP = (-4.0, 3.0)  # log-spectrum; beyond lie dead patches and lines of the sensor
 MAX_PATCHES = 280
 SPARSE = 4  # every so many-th pixel of a patch tells its depth
@@ -75,7 +75,7 @@ def gather_spectra(
     most: int = MAX_PATCHES,
 ) -> Spectra:
     """
-    Look at the patches of one scale, at about `most` of them.
+    Look at the patches of one scale, no more than `most`.
 
     images (H, W) each: grey, what counts of it 0..1 (0 = saturated or not trusted), and depth [m];
     axes G (9, 9).
