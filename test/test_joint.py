@@ -105,6 +105,14 @@ def test_at_half_the_size_half_as_many_pixels_are_looked_at(monkeypatch):
         assert sum(part.light.size for part in parts) == pytest.approx(most, rel=0.05)
 
 
+def test_of_long_blurs_fewer_pixels_of_any_picture_are_looked_at():
+    for wanted in (10_000, 10 * DEPTH.size):
+        effort = Effort(wanted, affordable=6.0)
+        parts = parts_of(blurred(TRUTH), 9.0, effort)
+        most = min(wanted, DEPTH.size) * 6 / 9
+        assert sum(part.light.size for part in parts) == pytest.approx(most, rel=0.05)
+
+
 def test_parts_lie_where_the_picture_is_busy():
     light = np.full(DEPTH.shape, 0.5, np.float32)
     light[10:40, 60:100] += texture(0, (30, 40)) - 0.5

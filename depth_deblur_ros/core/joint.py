@@ -27,7 +27,6 @@ from depth_deblur_ros.core.start import Start
 from depth_deblur_ros.core.threads import each
 import numpy as np
 
-AFFORDABLE = 24.0  # px; of longer blurs, fewer pixels are looked at
 MOST = 200_000  # px that are looked at; at half the size half of them, which show twice as much
 SATURATED = 0.97  # stored values
 LEAST_SIDE = 48  # px of a part
@@ -48,6 +47,7 @@ class Effort:
     pixels: int = MOST  # and no more
     moves: int = 4
     enough: float = 0.15  # px; the first shorter move is the last
+    affordable: float = 40.0  # px; of longer blurs, fewer pixels are looked at
     readable: float = 50.0  # px; longer blurs are refined at half the size, or less
     doubt: float = 1.0  # times as large is the covariance as that of a refinement to the end
     instants: float = math.inf  # over the mean blur, at most: noise hides finer ones
@@ -160,12 +160,12 @@ def _bent(bend: Vector, first: Vector, move: Vector, change: Vector) -> Vector:
 def _readable(level: Level, length: float, effort: Effort) -> tuple[Level, float]:
     """Give the level at a size where the blur is readable, and how many px of it to look at."""
     factor, least = 1, min(level.image.shape)
+    pixels = min(effort.pixels, level.image.size)
     while length > effort.readable * factor and least >= 4 * LEAST_SIDE * factor:
         factor *= 2
     if factor > 1:
         level = scaled_level(level, level.camera.width // factor, level.camera.height // factor)
-    pixels = effort.pixels * min(1.0, AFFORDABLE * factor / length)
-    return level, min(pixels, MOST / factor)
+    return level, min(pixels * min(1.0, effort.affordable * factor / length), MOST / factor)
 
 
 def _part(level: Level, k: int, pixels: float, pace: Pace) -> Part:
