@@ -9,6 +9,7 @@ from bench_robust import Case, CHANGES
 import cv2
 from depth_deblur_ros import bench
 from depth_deblur_ros.core.light import light_from_stored
+from depth_deblur_ros.core.params import SolverParams
 import numpy as np
 import pytest
 
@@ -94,3 +95,12 @@ def test_the_table_has_a_row_for_each_change(case, tmp_path, monkeypatch, capsys
     epe = np.mean([row['score']['epe'] for row in table])
     assert float(cells[1]) == pytest.approx(epe, abs=0.006)
     assert sharp.split('|')[2].strip() == '0.00'  # motion zero is the truth there
+
+
+def test_a_long_blur_stored_as_jpeg_is_found(data, tmp_path):
+    """Blocks of JPEG look like edges: too few looks at a blur of 45 px end 3 px off."""
+    case = data / 'eval/paper-mb2006_Cloth1'
+    (row,) = bench_robust.solved([case], 'jpeg', tmp_path, SolverParams())
+    assert row.score.blur_px > 40
+    assert (row.outcome, row.score.bad) == ('solved', 0.0)
+    assert row.score.epe < 2.2
