@@ -51,7 +51,8 @@ def test_a_start_that_is_too_short_or_too_long_comes_nearer(factor, effort, left
 
 
 @pytest.mark.parametrize(
-    'wrong', [{'pixels': 0}, {'moves': 0}, {'readable': 0.0}, {'enough': np.nan}]
+    'wrong',
+    [{'pixels': 0}, {'moves': 0}, {'affordable': 0.0}, {'readable': 0.0}, {'enough': np.nan}],
 )
 def test_an_effort_that_is_none_is_refused(wrong):
     with pytest.raises(InputError, match='not Effort'):

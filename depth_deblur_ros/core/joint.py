@@ -54,7 +54,7 @@ class Effort:
     pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
-        shares = self.enough, self.readable, self.doubt, self.instants
+        shares = self.enough, self.affordable, self.readable, self.doubt, self.instants
         more = all(value > 0 for value in shares)
         if self.pixels < 1 or self.moves < 1 or not more:
             raise InputError(f'pixels, moves must be >= 1, the rest > 0, not {self}')

@@ -44,12 +44,12 @@ FAST_OUTER, FAST_LONGER = 2, 1.2  # mode fast: reweightings, and how much longer
 # Of the joint refinement. A clean picture tells more the longer it is asked; another gives nearly
 # all that it knows at the first look, at fewer pixels, and of long blurs at half the size.
 CLEAN, NOISY = Effort(), Effort(120_000, enough=0.3, affordable=16.0, readable=24.0)
-BRIEF = Effort(
+BRIEF = replace(
+    NOISY,
     pixels=52_000,
     moves=2,
     enough=0.4,
     affordable=24.0,
-    readable=24.0,
     doubt=1.15,
     instants=8.0,
     pace=Pace(spacing=0.85, steps=6, last=8),
